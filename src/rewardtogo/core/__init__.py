@@ -1,0 +1,36 @@
+"""Protocols and data types; nothing else. Every other room imports this one."""
+
+from .fields import Configured as Configured
+from .fields import Number as Number
+from .fields import Schedule as Schedule
+from .fields import fix_horizon as fix_horizon
+from .fields import number as number
+from .fields import part as part
+from .fields import setting as setting
+from .fields import value_at as value_at
+from .protocols import Algorithm as Algorithm
+from .protocols import Environment as Environment
+from .protocols import Learner as Learner
+from .protocols import Model as Model
+from .protocols import Policy as Policy
+from .protocols import Solution as Solution
+from .protocols import VectorEnv as VectorEnv
+from .protocols import env_spec as env_spec
+from .protocols import float_metrics as float_metrics
+from .protocols import require_action as require_action
+from .spec import MASK as MASK
+from .spec import EnvSpec as EnvSpec
+from .spec import Spec as Spec
+from .spec import from_space as from_space
+from .types import Action as Action
+from .types import Actor as Actor
+from .types import Batch as Batch
+from .types import Carry as Carry
+from .types import Episodes as Episodes
+from .types import EpisodeStats as EpisodeStats
+from .types import Observation as Observation
+from .types import PRNGKey as PRNGKey
+from .types import Rollout as Rollout
+from .types import State as State
+from .types import Timestep as Timestep
+from .types import Transition as Transition

@@ -1,0 +1,116 @@
+"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, and a corridor of aliased states.
+
+Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), example 13.1 (the corridor); Singh, Jaakkola and
+Jordan (1994) on why a memoryless policy may have to be stochastic there.
+"""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+from .tabular import MDP, POMDP
+
+MOVES = ((-1, 0), (0, 1), (1, 0), (0, -1))
+"""The four actions of a board: up, right, down, left."""
+
+PACMAN_BOARD = (
+    "P  . ",
+    "  #  ",
+    ".#G  ",
+    "   # ",
+    "  .  ",
+)
+"""A 5x5 board: `P` the start, `.` a dot, `G` a ghost, `#` a wall."""
+
+
+def random_mdp(
+    seed: int,
+    num_states: int,
+    num_actions: int,
+    *,
+    discount: float = 0.9,
+    horizon: int | None = None,
+    num_terminal: int = 0,
+    concentration: float = 1.0,
+) -> MDP:
+    """A random MDP: Dirichlet transitions and starts, standard normal rewards; the last `num_terminal` states are terminal.
+
+    A small `concentration` makes the transitions nearly deterministic. Raises `ValueError` where no state would be left to act in.
+    """
+    if not 0 <= num_terminal < num_states:
+        raise ValueError(
+            f"{num_terminal} of {num_states} states cannot be terminal: at least one must be left to start in, and none can be missing"
+        )
+    rng = np.random.default_rng(seed)
+    transitions = _dirichlet(rng, concentration, (num_states, num_actions, num_states))
+    rewards = rng.normal(size=(num_states, num_actions))
+    live = num_states - num_terminal
+    initial = np.concatenate([_dirichlet(rng, 1.0, (live,)), np.zeros(num_terminal)])
+    return MDP(transitions, rewards, initial, discount, np.arange(num_states) >= live, horizon)
+
+
+def random_policy(seed: int, num_states: int, num_actions: int, horizon: int | None = None) -> Float[np.ndarray, "... S A"]:
+    """A random table of action probabilities `[S, A]`, or `[T, S, A]` for a `horizon`; every action is possible."""
+    lead = () if horizon is None else (horizon,)
+    return _dirichlet(np.random.default_rng(seed), 1.0, (*lead, num_states, num_actions))
+
+
+def _dirichlet(rng: np.random.Generator, concentration: float, shape: tuple[int, ...]) -> np.ndarray:
+    # The floor keeps a row of very small gamma variates (a small concentration underflows) from dividing 0 by 0.
+    gamma = np.maximum(rng.gamma(concentration, size=shape), 1e-12)
+    return gamma / gamma.sum(-1, keepdims=True)
+
+
+def pacman(board: tuple[str, ...] = PACMAN_BOARD, *, discount: float = 0.95, slip: float = 0.0) -> MDP:
+    """The notes' example of a hand-made reward, +1 for a dot and -100 for the ghost, on a small board (item 1.11).
+
+    - State: the square, and which dots are eaten: `dots_eaten * squares + square`, squares counted along the rows, dots as bits in
+      that order. The episode ends on a ghost or with the last dot.
+    - Actions: `MOVES`. Walls and edges stop a move. With probability `slip` a uniformly random move is made instead.
+
+    Raises `ValueError` for a board that is not a rectangle with one `P` and at least one dot.
+    """
+    squares = [square for row in board for square in row]
+    if len({len(row) for row in board}) != 1 or squares.count("P") != 1 or "." not in squares or set(squares) - set("P.G# "):
+        raise ValueError(f"the board {board!r} is not a rectangle of 'P', '.', 'G', '#' and ' ' with one 'P' and at least one '.'")
+    if not 0 <= slip <= 1:
+        raise ValueError(f"slip is {slip} and must be a probability in [0, 1]")
+    count, dots = len(squares), [i for i, square in enumerate(squares) if square == "."]
+    states = count * 2 ** len(dots)
+    outcomes = np.zeros((states, 4, states))
+    gains = np.zeros((states, 4, states))
+    terminal = np.zeros(states, bool)
+    for eaten, square, action in itertools.product(range(2 ** len(dots)), range(count), range(4)):
+        state, landing = eaten * count + square, _move(board, square, action)
+        dot = 1 << dots.index(landing) if landing in dots else 0
+        following = (eaten | dot) * count + landing
+        outcomes[state, action, following] = 1
+        gains[state, action, following] = -100 if squares[landing] == "G" else float(dot and not eaten & dot)
+        terminal[state] = squares[square] == "G" or eaten == 2 ** len(dots) - 1
+    transitions = (1 - slip) * outcomes + slip * outcomes.mean(1, keepdims=True)
+    return MDP(transitions, gains.max(1, keepdims=True) + gains.min(1, keepdims=True) + np.zeros_like(gains),
+               squares.index("P"), discount, terminal)  # fmt: skip
+
+
+def _move(board: tuple[str, ...], square: int, action: int) -> int:
+    """Where a move from a square ends: the same square at an edge or before a wall."""
+    width = len(board[0])
+    row, column = square // width + MOVES[action][0], square % width + MOVES[action][1]
+    inside = 0 <= row < len(board) and 0 <= column < width
+    return row * width + column if inside and board[row][column] != "#" else square
+
+
+def aliased_corridor(*, discount: float = 1.0, horizon: int | None = None) -> POMDP:
+    """Three squares and a goal that all look the same, and in the second of them left and right are swapped (item 1.6).
+
+    Every step costs 1. With the state in view the goal is 3 steps away; a memoryless policy that goes right with probability p
+    needs 2 (2 - p) / (p (1 - p)) steps, least at p = 2 - √2, where it is 6 + 4 √2 = 11.66, and for ever if it is deterministic.
+    """
+    left, right = 0, 1
+    transitions = np.zeros((4, 2, 4))
+    for state, (to_left, to_right) in enumerate([(0, 1), (2, 0), (1, 3)]):
+        transitions[state, left, to_left] = transitions[state, right, to_right] = 1
+    transitions[3, :, 3] = 1
+    goal = np.arange(4) == 3
+    return POMDP(MDP(transitions, -np.ones((4, 2)), 0, discount, goal, horizon), np.ones((4, 1)))

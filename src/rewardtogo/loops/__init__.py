@@ -1,0 +1,7 @@
+"""Loops: they make a `Learner` an `Algorithm`."""
+
+from .collect import RandomPolicy as RandomPolicy
+from .collect import begin as begin
+from .collect import collect as collect
+from .off_policy import OffPolicy as OffPolicy
+from .on_policy import OnPolicy as OnPolicy

@@ -1,0 +1,139 @@
+"""Act, remember, learn from memory: the loop of every learner that can use old data (figure 6.2: collection, replay, updates)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..core import Actor, Algorithm, Configured, Episodes, EnvSpec, Learner, Policy, PRNGKey, State, VectorEnv, env_spec, fix_horizon, part, setting
+from ..data.replay import ReplayState, UniformReplay
+from .collect import RandomPolicy, begin, collect
+
+
+class OffPolicyState(eqx.Module):
+    """The learner's state, where the environments stand, and the memory of what happened."""
+
+    learner: State
+    actor: Actor
+    replay: ReplayState
+
+
+class OffPolicy(Algorithm, Configured):
+    """Each iteration takes `unroll` steps in each environment and then learns from `updates` batches drawn from the replay.
+
+    The first `warm_up` steps, inside `init`, are those of a uniformly random policy. Raises `ValueError` where the learner wants
+    fresh rollouts, or where the replay cannot hold what is asked of it.
+    """
+
+    env: VectorEnv
+    learner: Learner
+    replay: UniformReplay = part(UniformReplay(), "the memory")
+    unroll: int = setting(4, "steps in each environment between two visits to the replay", at_least=1)
+    updates: int = setting(1, "batches learnt from in each iteration", at_least=1)
+    batch_size: int = setting(64, "transitions (or sequences) in a batch", at_least=1)
+    warm_up: int = setting(1000, "environment steps of a random policy before the first update", at_least=1)
+    length: int = setting(16, "steps of a sequence, for learners that want sequences", at_least=1)
+
+    def __check_init__(self) -> None:
+        if self.learner.batch == "rollout":
+            raise ValueError(f"{type(self.learner).__name__} needs fresh rollouts of its own policy, which a replay cannot give: use OnPolicy")
+        if self.replay.capacity < self._block:
+            raise ValueError(f"a replay of {self.replay.capacity} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
+                             f"environments: give it a capacity of at least {self._block}")
+        if self._sequential and self.replay.capacity // self._block * self.unroll < self.length:
+            raise ValueError(f"a replay of {self.replay.capacity} transitions holds no sequence of {self.length} steps: "
+                             f"give it a capacity of at least {self.length * self.env.num_envs + self._block}")
+
+    @property
+    def _block(self) -> int:
+        return self.unroll * self.env.num_envs
+
+    @property
+    def _sequential(self) -> bool:
+        return self.learner.batch == "sequences"
+
+    @property
+    def _warm_up_blocks(self) -> int:
+        wanted = -(-self.warm_up // self._block)
+        return max(wanted, -(-self.length // self.unroll)) if self._sequential else wanted
+
+    @property
+    def spec(self) -> EnvSpec:
+        return env_spec(self.env)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        return self._block
+
+    @property
+    def initial_steps(self) -> int:
+        return self._warm_up_blocks * self._block
+
+    def with_horizon(self, iterations: int) -> "OffPolicy":
+        return dataclasses.replace(self, learner=fix_horizon(self.learner, iterations * self.updates))
+
+    def init(self, key: PRNGKey) -> OffPolicyState:
+        learner_key, actor_key, warm_key = jax.random.split(key, 3)
+        learner = self.learner.init(self.spec, learner_key)
+        policy = self.learner.policy(learner, explore=True)
+        actor = begin(self.env, policy, actor_key)
+        random = _Carrying(RandomPolicy(self.spec), policy)
+        keys = jax.random.split(warm_key, self._warm_up_blocks)
+        _, example, _ = jax.eval_shape(lambda a, k: collect(self.env, policy, a, k, self.unroll, self._sequential), actor, keys[0])
+        replay = self.replay.init(example.transitions, self.unroll)
+
+        def block(loop: tuple[Actor, ReplayState], key: PRNGKey) -> tuple[tuple[Actor, ReplayState], None]:
+            actor, replay = loop
+            actor, rollout, _ = collect(self.env, random, actor, key, self.unroll, self._sequential)
+            return (actor, self.replay.add(replay, rollout.transitions)), None
+
+        (actor, replay), _ = jax.lax.scan(block, (actor, replay), keys)
+        return OffPolicyState(learner, actor, replay)
+
+    def step(self, state: OffPolicyState, key: PRNGKey) -> tuple[OffPolicyState, tuple[dict[str, jax.Array], Episodes]]:
+        collect_key, learn_key = jax.random.split(key)
+        policy = self.learner.policy(state.learner, explore=True)
+        actor, rollout, episodes = collect(self.env, policy, state.actor, collect_key, self.unroll, self._sequential)
+        replay = self.replay.add(state.replay, rollout.transitions)
+
+        def update(learner: State, key: PRNGKey) -> tuple[State, dict[str, jax.Array]]:
+            sample_key, update_key = jax.random.split(key)
+            if self._sequential:
+                batch = self.replay.sample_sequences(replay, sample_key, self.batch_size, self.length)
+            else:
+                batch = self.replay.sample(replay, sample_key, self.batch_size)
+            learner, metrics, _ = self.learner.update(learner, batch, update_key)
+            return learner, metrics
+
+        if self.updates == 1:
+            learner, metrics = update(state.learner, learn_key)
+        else:
+            learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(learn_key, self.updates))
+            metrics = jax.tree.map(jnp.mean, metrics)
+        return OffPolicyState(learner, actor, replay), (metrics, episodes)
+
+    def learned(self, state: OffPolicyState) -> State:
+        return state.learner
+
+    def policy(self, state: OffPolicyState, explore: bool = False) -> Policy:
+        return self.learner.policy(state.learner, explore)
+
+
+class _Carrying(Policy):
+    """The actions of one policy, the memory and the extras of another, so that warm-up data looks like the learner's own."""
+
+    action: Policy
+    memory: Policy
+
+    def init(self, key: PRNGKey) -> State:
+        return self.memory.init(key)
+
+    def __call__(self, carry: State, observation: State, key: PRNGKey) -> tuple[State, State, dict[str, jax.Array]]:
+        action_key, memory_key = jax.random.split(key)
+        _, action, _ = self.action((), observation, action_key)
+        carry, like, extras = self.memory(carry, observation, memory_key)
+        return carry, jax.tree.map(lambda a, b: a.astype(b.dtype), action, like), extras
+
+    def inspect(self, carry: State, observation: State) -> dict[str, jax.Array]:
+        return self.memory.inspect(carry, observation)

@@ -1,0 +1,65 @@
+"""Collect, learn, forget: the loop of every learner that wants fresh data from its own policy (figure 1.2, chapters 3, 4, 7)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+
+from ..core import Actor, Algorithm, Configured, Episodes, EnvSpec, Learner, Policy, PRNGKey, State, VectorEnv, env_spec, fix_horizon, setting
+from .collect import begin, collect
+
+
+class OnPolicyState(eqx.Module):
+    """The learner's state and where the environments stand."""
+
+    learner: State
+    actor: Actor
+
+
+class OnPolicy(Algorithm, Configured):
+    """Each iteration takes `unroll` steps in each environment with the current policy and learns from them once.
+
+    Raises `ValueError` where the learner wants anything else than a rollout.
+    """
+
+    env: VectorEnv
+    learner: Learner
+    unroll: int = setting(128, "steps in each environment between two updates", at_least=1)
+
+    def __check_init__(self) -> None:
+        if self.learner.batch != "rollout":
+            raise ValueError(f"{type(self.learner).__name__} learns from {self.learner.batch}, not from fresh rollouts: "
+                             "use OffPolicy (with environments) or Offline (with a dataset)")
+
+    @property
+    def spec(self) -> EnvSpec:
+        return env_spec(self.env)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        return self.unroll * self.env.num_envs
+
+    @property
+    def initial_steps(self) -> int:
+        return 0
+
+    def with_horizon(self, iterations: int) -> "OnPolicy":
+        return dataclasses.replace(self, learner=fix_horizon(self.learner, iterations))
+
+    def init(self, key: PRNGKey) -> OnPolicyState:
+        learner_key, actor_key = jax.random.split(key)
+        learner = self.learner.init(self.spec, learner_key)
+        return OnPolicyState(learner, begin(self.env, self.learner.policy(learner, explore=True), actor_key))
+
+    def step(self, state: OnPolicyState, key: PRNGKey) -> tuple[OnPolicyState, tuple[dict[str, jax.Array], Episodes]]:
+        collect_key, update_key = jax.random.split(key)
+        policy = self.learner.policy(state.learner, explore=True)
+        actor, rollout, episodes = collect(self.env, policy, state.actor, collect_key, self.unroll)
+        learner, metrics, _ = self.learner.update(state.learner, rollout, update_key)
+        return OnPolicyState(learner, actor), (metrics, episodes)
+
+    def learned(self, state: OnPolicyState) -> State:
+        return state.learner
+
+    def policy(self, state: OnPolicyState, explore: bool = False) -> Policy:
+        return self.learner.policy(state.learner, explore)

@@ -1,0 +1,22 @@
+"""Networks, heads, encoders and running normalisation."""
+
+from .actor_critic import ActorCritic as ActorCritic
+from .actor_critic import ActorCriticPolicy as ActorCriticPolicy
+from .encoding import RunningNorm as RunningNorm
+from .encoding import action_mask as action_mask
+from .encoding import flat_size as flat_size
+from .encoding import flatten_observation as flatten_observation
+from .encoding import has_images as has_images
+from .heads import ACTION_KINDS as ACTION_KINDS
+from .heads import ActionHead as ActionHead
+from .network import CNN as CNN
+from .network import MLP as MLP
+from .network import Custom as Custom
+from .network import Linear as Linear
+from .network import Network as Network
+from .network import Torso as Torso
+from .network import as_network as as_network
+from .recurrent import GRU as GRU
+from .recurrent import LSTM as LSTM
+from .recurrent import is_recurrent as is_recurrent
+from .recurrent import unroll as unroll

@@ -1,0 +1,109 @@
+"""Networks with a memory: GRU (Cho et al. 2014) and LSTM (Hochreiter and Schmidhuber 1997) over an encoder shared by all steps."""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..core import Carry, Observation, PRNGKey, Spec
+from .network import MLP, Linear, Network, Torso, as_network
+
+
+class GRU(Network):
+    """`GRU(64)`: an encoder, then a gated recurrent unit of 64 numbers."""
+
+    size: int = eqx.field(static=True)
+    encoder: Network
+
+    def __init__(self, size: int = 64, encoder: Network | None = None):
+        self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
+
+    def build(self, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
+        return _build("gru", 3, self.size, self.encoder, spec, key)
+
+
+class LSTM(Network):
+    """`LSTM(64)`: an encoder, then a long short-term memory of 64 numbers (and as many cells)."""
+
+    size: int = eqx.field(static=True)
+    encoder: Network
+
+    def __init__(self, size: int = 64, encoder: Network | None = None):
+        self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
+
+    def build(self, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
+        return _build("lstm", 4, self.size, self.encoder, spec, key)
+
+
+def _checked(size: int) -> int:
+    if size < 1:
+        raise ValueError(f"a recurrent network needs at least one unit, not {size}")
+    return size
+
+
+def _build(kind: Literal["gru", "lstm"], gates: int, size: int, encoder: Network, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
+    encoder_key, input_key, memory_key = jax.random.split(key, 3)
+    torso = encoder.build(spec, encoder_key)
+    # Each gate is orthogonal by itself, so that no gate starts with more weight than another.
+    stack = lambda key, inputs: jax.vmap(lambda k: Linear.of(inputs, size, k, 1.0).weight)(jax.random.split(key, gates))  # noqa: E731
+    inputs = stack(input_key, torso.features).reshape(gates * size, -1)
+    bias = jnp.zeros(gates * size)
+    # A forget gate that starts open keeps early gradients alive (Gers et al. 2000).
+    bias = bias.at[size : 2 * size].set(1.0) if kind == "lstm" else bias
+    return RecurrentTorso(torso, Linear(inputs, bias), stack(memory_key, size).reshape(gates * size, size), kind)
+
+
+class RecurrentTorso(Torso):
+    """Encoder, then one cell. The memory is `(hidden, cell)`; a GRU's cell is empty."""
+
+    encoder: Torso
+    inputs: Linear
+    memory: Float[Array, "G H"]
+    kind: Literal["gru", "lstm"] = eqx.field(static=True)
+
+    @property
+    def features(self) -> int:
+        return self.memory.shape[1]
+
+    def init(self) -> Carry:
+        zeros = jnp.zeros(self.features)
+        return (zeros, zeros) if self.kind == "lstm" else (zeros, jnp.zeros(0))
+
+    def __call__(self, carry: Carry, observation: Observation) -> tuple[Carry, Float[Array, "H"]]:
+        hidden, cell = carry
+        _, x = self.encoder(self.encoder.init(), observation)
+        mine, past = self.inputs(x), self.memory @ hidden
+        if self.kind == "lstm":
+            enter, forget, leave, content = jnp.split(mine + past, 4)
+            cell = jax.nn.sigmoid(forget) * cell + jax.nn.sigmoid(enter) * jnp.tanh(content)
+            hidden = jax.nn.sigmoid(leave) * jnp.tanh(cell)
+            return (hidden, cell), hidden
+        (update, reset, content), (update_past, reset_past, content_past) = jnp.split(mine, 3), jnp.split(past, 3)
+        gate = jax.nn.sigmoid(update + update_past)
+        candidate = jnp.tanh(content + jax.nn.sigmoid(reset + reset_past) * content_past)
+        hidden = (1.0 - gate) * candidate + gate * hidden
+        return (hidden, cell), hidden
+
+
+def unroll(torso: Torso, carry: Carry, observations: Observation, done: Bool[Array, "T"]) -> tuple[Carry, Float[Array, "T F"]]:
+    """Features of a sequence `[T, ...]`, the memory reset after every step where an episode ended.
+
+    Returns the memory after each observation and before any reset, `[T, ...]` (where values of `next_observation` are taken from),
+    and the features `[T, F]`. The same numbers as acting step by step.
+    """
+
+    def step(carry: Carry, inputs: tuple[Observation, Array]) -> tuple[Carry, tuple[Carry, Array]]:
+        observation, done = inputs
+        after, features = torso(carry, observation)
+        reset = jax.tree.map(lambda fresh, old: jnp.where(done, fresh, old), torso.init(), after)
+        return reset, (after, features)
+
+    _, (carries, features) = jax.lax.scan(step, carry, (observations, done))
+    return carries, features
+
+
+def is_recurrent(torso: Torso) -> bool:
+    """Whether the torso has a memory."""
+    return bool(jax.tree.leaves(torso.init()))

@@ -1,0 +1,161 @@
+"""PPO: proximal policy optimisation with a clipped surrogate (chapter 7; Schulman et al. 2017).
+
+Maximises, over a few epochs on the same rollout of the policy pi_old,
+
+    E[min(rho A, clip(rho, 1 - eps, 1 + eps) A)] + c_H E[H(pi)] - c_V E[1/2 (V - y)^2],      rho = pi(a|s) / pi_old(a|s),
+
+with A from GAE (item 4.33) and y = A + V. `terminated` ends a return, `truncated` bootstraps from `next_observation` (erratum E1.5).
+
+Deviations from the paper, as is now usual: advantages are normalised in each minibatch, gradients are clipped by their global norm,
+actor and critic are two networks with orthogonal initialisation (Andrychowicz et al. 2021), Adam's epsilon is 1e-5. The remainder
+of a rollout that does not divide into minibatches is left out, a different one each epoch.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..core import Action, Carry, EnvSpec, Learner, Number, Observation, PRNGKey, Rollout, number, part, require_action, setting, value_at
+from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Network, RunningNorm, as_network
+from ..ops.advantages import gae, normalise
+
+
+class PPOState(eqx.Module):
+    """Networks, optimiser, what observations look like, and the number of updates done."""
+
+    network: ActorCritic
+    optimiser: optax.OptState
+    norm: RunningNorm | None
+    updates: Int[Array, ""]
+
+
+class Samples(eqx.Module):
+    """What the loss looks at: single steps `[N]`, or with a memory whole sequences `[B, T]`."""
+
+    observation: Observation
+    action: Action
+    log_prob: Float[Array, "..."]
+    advantage: Float[Array, "..."]
+    target: Float[Array, "..."]
+    done: Bool[Array, "..."]
+    carry: Carry
+
+
+class PPO(Learner):
+    """Proximal policy optimisation. Any action space but dictionaries; any observation; networks with or without a memory."""
+
+    network: Network = part(MLP(64, 64), "recipe of the actor's and of the critic's network", converter=as_network)
+    learning_rate: Number = number(3e-4, "Adam's step size", above=0)
+    gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
+    gae_lambda: Number = number(0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1)
+    clip: Number = number(0.2, "eps: how far the ratio may move before its gradient is cut", above=0)
+    entropy_cost: Number = number(0.0, "c_H: weight of the entropy bonus", at_least=0)
+    value_cost: Number = number(0.5, "c_V: weight of the value loss", at_least=0)
+    max_grad_norm: Number = number(0.5, "gradients are scaled down to this global norm", above=0)
+    epochs: int = setting(4, "passes over each rollout", at_least=1)
+    minibatches: int = setting(4, "gradient steps a pass; with a memory each takes whole environments", at_least=1)
+    normalise_advantages: bool = setting(True, "mean 0, sd 1 in each minibatch")
+    normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
+
+    @property
+    def batch(self) -> Literal["rollout"]:
+        return "rollout"
+
+    @property
+    def action_kinds(self) -> tuple[str, ...]:
+        return ACTION_KINDS
+
+    def init(self, spec: EnvSpec, key: PRNGKey) -> PPOState:
+        require_action("PPO", spec, self.action_kinds)
+        network = ActorCritic.of(self.network, spec, key)
+        norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
+        return PPOState(network, self._optimiser(jnp.zeros((), jnp.int32)).init(network), norm, jnp.zeros((), jnp.int32))
+
+    def policy(self, state: PPOState, explore: bool) -> ActorCriticPolicy:
+        return ActorCriticPolicy(state.network, state.norm, explore)
+
+    def update(self, state: PPOState, batch: Rollout, key: PRNGKey) -> tuple[PPOState, dict[str, Array], tuple[()]]:
+        samples, value = self._samples(state, batch)
+        size = len(samples.log_prob)
+        per_minibatch = self._minibatch_size(size, state.network.recurrent)
+        optimiser = self._optimiser(state.updates)
+        epsilon, entropy_cost = value_at(self.clip, state.updates), value_at(self.entropy_cost, state.updates)
+
+        def minibatch(loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]) -> tuple[tuple, dict[str, Array]]:
+            network, optimiser_state = loop
+            chosen = jax.tree.map(lambda x: x[rows], samples)
+            gradient, metrics = jax.grad(self._loss, has_aux=True)(network, chosen, epsilon, entropy_cost)
+            step, optimiser_state = optimiser.update(gradient, optimiser_state)
+            return (optax.apply_updates(network, step), optimiser_state), metrics | {"grad_norm": optax.global_norm(gradient)}
+
+        used = self.minibatches * per_minibatch
+        shuffled = jax.vmap(lambda k: jax.random.permutation(k, size)[:used])(jax.random.split(key, self.epochs))
+        loop = (state.network, state.optimiser)
+        (network, optimiser_state), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
+        # Statistics change after the update, so that the ratio starts at exactly 1.
+        norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
+        metrics = jax.tree.map(jnp.mean, metrics) | {"explained_variance": explained_variance(value, samples.target)}
+        return PPOState(network, optimiser_state, norm, state.updates + 1), metrics, ()
+
+    def _samples(self, state: PPOState, rollout: Rollout) -> tuple[Samples, Float[Array, "..."]]:
+        """Advantages and targets of a rollout, arranged as the loss takes them; and the old values, likewise."""
+        t = rollout.transitions
+        norm = (lambda x: x) if state.norm is None else state.norm
+        value, next_value = state.network.values(rollout, norm)
+        gamma, lam = value_at(self.gamma, state.updates), value_at(self.gae_lambda, state.updates)
+        discount = gamma * (1.0 - t.terminated)
+        advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)(t.reward, discount, value, next_value, lam, t.done)
+        observation = jax.vmap(jax.vmap(norm))(t.observation)
+        steps = Samples(observation, t.action, t.extras["log_prob"], advantage, advantage + value, t.done, ())
+        if not state.network.recurrent:
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (steps, value))
+        steps, value = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (steps, value))
+        return eqx.tree_at(lambda s: s.carry, steps, rollout.carry), value
+
+    def _loss(self, network: ActorCritic, s: Samples, epsilon: Array, entropy_cost: Array) -> tuple[Array, dict[str, Array]]:
+        def one(observation: Observation, action: Action, done: Array, carry: Carry) -> tuple[Array, Array, Array]:
+            if network.recurrent:
+                distribution, value = network.replay(carry, observation, done)
+                read = jax.vmap(lambda d, a: (d.log_prob(a), d.entropy()))
+                return *read(distribution, action), value
+            distribution = network.act(network.init()[0], observation)[1]
+            value = network.value(network.init()[1], observation)[1]
+            return distribution.log_prob(action), distribution.entropy(), value
+
+        log_prob, entropy, value = jax.vmap(one)(s.observation, s.action, s.done, s.carry)
+        advantage = normalise(s.advantage) if self.normalise_advantages else s.advantage
+        log_ratio = log_prob - s.log_prob
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
+        policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
+        value_loss = 0.5 * ((value - s.target) ** 2).mean()
+        entropy = entropy.mean()
+        loss = policy_loss + self.value_cost * value_loss - entropy_cost * entropy
+        return loss, {
+            "policy_loss": policy_loss,
+            "value_loss": value_loss,
+            "entropy": entropy,
+            "approx_kl": (ratio - 1.0 - log_ratio).mean(),
+            "clip_fraction": (jnp.abs(ratio - 1.0) > epsilon).mean(),
+        }
+
+    def _optimiser(self, updates: Array) -> optax.GradientTransformation:
+        rate = value_at(self.learning_rate, updates)
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(rate, eps=1e-5))
+
+    def _minibatch_size(self, size: int, recurrent: bool) -> int:
+        if size < self.minibatches:
+            what = "environments (a memory needs whole ones)" if recurrent else "steps"
+            raise ValueError(f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
+                             f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}")
+        return size // self.minibatches
+
+
+def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
+    """1 - Var(target - value) / Var(target): 1 is a perfect critic, 0 one that knows nothing. 0 where targets do not vary."""
+    spread = jnp.var(target)
+    return jnp.where(spread > 0, 1.0 - jnp.var(target - value) / jnp.where(spread > 0, spread, 1.0), 0.0)
