@@ -1,1 +1,95 @@
-"""rewardtogo."""
+"""rewardtogo: deep reinforcement learning on JAX, one API from CartPole to control as inference.
+
+    import rewardtogo as rtg
+    run = rtg.train("ppo", "CartPole-v1", steps=100_000, seed=0)
+    policy = rtg.load(run.path)
+
+Names are imported when they are first used, so that `import rewardtogo` alone does not load JAX.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .core import Algorithm as Algorithm
+    from .core import Batch as Batch
+    from .core import Configured as Configured
+    from .core import Environment as Environment
+    from .core import EnvSpec as EnvSpec
+    from .core import Learner as Learner
+    from .core import Model as Model
+    from .core import Policy as Policy
+    from .core import Rollout as Rollout
+    from .core import Solution as Solution
+    from .core import Spec as Spec
+    from .core import Timestep as Timestep
+    from .core import Transition as Transition
+    from .core import VectorEnv as VectorEnv
+    from .core import number as number
+    from .core import part as part
+    from .core import setting as setting
+    from .data.replay import UniformReplay as UniformReplay
+    from .envs.gymnasium import EnvironmentFailure as EnvironmentFailure
+    from .envs.gymnasium import GymnasiumEnv as GymnasiumEnv
+    from .envs.registry import make as make
+    from .envs.vectorize import vectorize as vectorize
+    from .imitation.bc import BC as BC
+    from .loops.collect import collect as collect
+    from .loops.off_policy import OffPolicy as OffPolicy
+    from .loops.offline import Offline as Offline
+    from .loops.on_policy import OnPolicy as OnPolicy
+    from .nn.network import CNN as CNN
+    from .nn.network import MLP as MLP
+    from .nn.recurrent import GRU as GRU
+    from .nn.recurrent import LSTM as LSTM
+    from .policy_gradient.ppo import PPO as PPO
+    from .policy_gradient.reinforce import REINFORCE as REINFORCE
+    from .runner.engine import Every as Every
+    from .runner.engine import Moment as Moment
+    from .runner.engine import NonFinite as NonFinite
+    from .runner.engine import run as run
+    from .runner.policy import load as load
+    from .runner.train import Run as Run
+    from .runner.train import resume as resume
+    from .runner.train import train as train
+    from .value.dqn import DQN as DQN
+
+_HOMES = {
+    "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
+            "number part setting",
+    "data.replay": "UniformReplay",
+    "envs.gymnasium": "EnvironmentFailure GymnasiumEnv",
+    "envs.registry": "make",
+    "envs.vectorize": "vectorize",
+    "imitation.bc": "BC",
+    "loops.collect": "collect",
+    "loops.off_policy": "OffPolicy",
+    "loops.offline": "Offline",
+    "loops.on_policy": "OnPolicy",
+    "nn.network": "CNN MLP",
+    "nn.recurrent": "GRU LSTM",
+    "policy_gradient.ppo": "PPO",
+    "policy_gradient.reinforce": "REINFORCE",
+    "runner.engine": "Every Moment NonFinite run",
+    "runner.policy": "load",
+    "runner.train": "Run resume train",
+    "value.dqn": "DQN",
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
+_ROOMS = ("core", "data", "envs", "exact", "figures", "imitation", "loops", "nn", "ops", "policy_gradient", "runner", "value")
+
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    if name in _ROOMS:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *_ROOMS]

@@ -66,6 +66,10 @@ class Range:
             and (self.below is None or value < self.below)
         )
 
+    def closed(self) -> "Range":
+        """The same interval with its ends, which a schedule may come to."""
+        return Range(self.at_least if self.above is None else self.above, self.at_most if self.below is None else self.below)
+
     def __str__(self) -> str:
         low = f"[{self.at_least:g}" if self.at_least is not None else f"({self.above:g}" if self.above is not None else "(-inf"
         high = f"{self.at_most:g}]" if self.at_most is not None else f"{self.below:g})" if self.below is not None else "inf)"
@@ -73,7 +77,7 @@ class Range:
 
 
 def number(
-    default: float,
+    default: float | Schedule,
     doc: str,
     *,
     at_least: float | None = None,
@@ -83,7 +87,7 @@ def number(
 ) -> Any:
     """A traced float hyperparameter: its default, what it means, and the interval it must lie in."""
     span = Range(at_least, at_most, above, below)
-    return eqx.field(default=float(default), converter=_as_number, metadata={"doc": doc, "range": span, "traced": True})
+    return eqx.field(default=_as_number(default), converter=_as_number, metadata={"doc": doc, "range": span, "traced": True})
 
 
 def setting(
@@ -130,7 +134,7 @@ def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
     span = meta["range"]
     if meta["traced"]:
         if isinstance(value, Schedule):
-            values = value.extremes()
+            values, span = value.extremes(), span.closed()
         elif isinstance(value, float) or (hasattr(value, "dtype") and np.issubdtype(value.dtype, np.number)):
             values = tuple(np.asarray(value, np.float64).ravel())
         else:

@@ -2,10 +2,11 @@
 
     P[s, a, s'] = p(s_{t+1} = s' | s_t = s, a_t = a),   R[s, a] = r(s, a),   p_0[s] = p(s_0 = s),   discount γ.
 
-Given (s_t, a_t), the next state does not depend on anything earlier (erratum E1.4 words it so). In a partially observed problem the
-agent sees o_t ~ O(· | s_t) in place of s_t. Terminal states have value 0: entering one gives `terminated` (erratum E1.5). A finite
-`horizon` T is a true end of the problem too, V_T = 0 (erratum E1.2), so the T-th step gives `terminated`; a time limit that only
-cuts episodes short is a wrapper's business and gives `truncated`.
+Given (s_t, a_t), the next state does not depend on anything earlier (erratum E1.4 words it so). In a partially
+observed problem the agent sees o_t ~ O(· | s_t) in place of s_t. Terminal states have value 0: entering one gives
+`terminated` (erratum E1.5). A finite `horizon` T is a true end of the problem too, V_T = 0 (erratum E1.2), so the
+T-th step gives `terminated`; a time limit that only cuts episodes short is a wrapper's business and gives
+`truncated`.
 
 Source: notes, section 1.1.
 """
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rewardtogo.core import Environment, Model, PRNGKey, Timestep
+from ..core import Environment, Model, PRNGKey, Timestep
 
 Table = Array | np.ndarray | Sequence
 
@@ -31,7 +32,10 @@ def _as_floats(values: Table) -> np.ndarray:
 
 
 def check_distributions(name: str, rows: np.ndarray) -> None:
-    """Raise `ValueError` unless the last axis of `rows` holds probabilities: none negative, sum 1 within 1e-12 (float32: 1e-5)."""
+    """Raise `ValueError` unless the last axis of `rows` holds probabilities.
+
+    None may be negative, and they must sum to 1 within 1e-12 (float32: 1e-5).
+    """
     tolerance = 1e-12 if rows.dtype == np.float64 else 1e-5
     negative = np.argwhere(~(rows >= 0))
     if len(negative):
@@ -42,35 +46,33 @@ def check_distributions(name: str, rows: np.ndarray) -> None:
     if len(wrong):
         place, value = ", ".join([*map(str, wrong[0]), ":"]), sums[tuple(wrong[0])]
         raise ValueError(
-            f"{name}[{place}] sums to {value:.15g} and probabilities must sum to 1 within {tolerance:g}: "
-            "divide it by its sum"
+            f"{name}[{place}] sums to {value:.15g} and probabilities must sum to 1 within {tolerance:g}: mend that row"
         )
 
 
-def can_end(continuation: np.ndarray) -> np.ndarray:
-    """Which states can leave: from which a path of positive probability leads to a row of `continuation` that sums to less than 1.
-
-    `continuation[..., s, s']` is P(s' | s) where s' is not terminal and 0 elsewhere. Returns `[..., S]`.
-    """
-    ends = continuation.sum(-1) < 1 - 1e-9
-    for _ in range(continuation.shape[-1]):
-        ends = ends | ((continuation > 0) & ends[..., None, :]).any(-1)
+def can_end(transitions: Array | np.ndarray, terminal: Array | np.ndarray) -> np.ndarray:
+    """From which states a path of positive probability leads to a terminal one: `[..., S]` for chains `[..., S, S]`."""
+    possible = np.asarray(transitions) > 0
+    ends = np.broadcast_to(np.asarray(terminal), possible.shape[:-1])
+    for _ in range(possible.shape[-1]):
+        ends = ends | (possible & ends[..., None, :]).any(-1)
     return ends
 
 
 class MDP(eqx.Module):
-    """A validated Markov decision process in arrays (items 1.1 and 1.9). Build it outside compiled code; its leaves are NumPy arrays.
+    """A validated Markov decision process in arrays (items 1.1 and 1.9). Build it outside compiled code.
 
     - `transitions`: P, rows sum to 1 within 1e-12.
-    - `rewards`: r(s, a). Given as r(s, a, s') they are reduced to r(s, a) = Σ_s' P(s' | s, a) r(s, a, s'), which leaves every
-      value as it was, and kept in `outcome_rewards` too, for the environment to give.
+    - `rewards`: r(s, a). Given as r(s, a, s') they are reduced to r(s, a) = Σ_s' P(s' | s, a) r(s, a, s'), which
+      leaves every value as it was, and kept in `outcome_rewards` too, for the environment to give.
     - `initial`: p_0, or the one state that episodes start in. Terminal states cannot be started in.
     - `discount`: γ in [0, 1]. 1 needs a horizon or, from every state, a way to a terminal one.
-    - `terminal`: which states end the episode when they are entered. They are stored as absorbing with reward 0, whatever the
-      arrays say of them, so that V(terminal) = 0 needs no special case.
+    - `terminal`: which states end the episode when they are entered. They are stored as absorbing with reward 0,
+      whatever the arrays say of them, so that V(terminal) = 0 needs no special case.
     - `horizon`: T, the number of actions, or `None`.
 
-    float32 arrays stay float32, all else becomes float64. Raises `ValueError` for anything that is not such a process.
+    The leaves are NumPy arrays: float32 stays float32, all else becomes float64. Raises `ValueError` for anything
+    that is not such a process.
     """
 
     transitions: Float[Array | np.ndarray, "S A S"]
@@ -91,7 +93,11 @@ class MDP(eqx.Module):
         horizon: int | None = None,
     ) -> None:
         self.transitions = _as_floats(transitions)
-        if self.transitions.ndim != 3 or self.transitions.shape[0] != self.transitions.shape[2] or not self.transitions.size:
+        if (
+            self.transitions.ndim != 3
+            or self.transitions.shape[0] != self.transitions.shape[2]
+            or not self.transitions.size
+        ):
             raise ValueError(
                 f"transitions has shape {self.transitions.shape}, and it must be [S, A, S]: "
                 "for each state and action a distribution over the next states"
@@ -99,7 +105,9 @@ class MDP(eqx.Module):
         states, actions, _ = self.transitions.shape
         self.terminal = np.array([False] * states if terminal is None else terminal, bool)
         if self.terminal.shape != (states,):
-            raise ValueError(f"terminal has shape {self.terminal.shape} for {states} states: give one flag for each state")
+            raise ValueError(
+                f"terminal has shape {self.terminal.shape} for {states} states: give one flag for each state"
+            )
         given = _as_floats(rewards)
         if given.shape not in ((states, actions), (states, actions, states)):
             raise ValueError(
@@ -107,7 +115,9 @@ class MDP(eqx.Module):
                 f"[{states}, {actions}, {states}]: give r(s, a) or r(s, a, s')"
             )
         if not np.all(np.isfinite(given)):
-            raise ValueError("rewards has an entry that is not finite, so no value is defined: use a finite penalty instead")
+            raise ValueError(
+                "rewards has an entry that is not finite, so no value is defined: use a finite penalty instead"
+            )
         self.transitions[self.terminal] = np.eye(states, dtype=self.transitions.dtype)[self.terminal][:, None]
         given[self.terminal] = 0
         self.outcome_rewards = given if given.ndim == 3 else None
@@ -122,14 +132,16 @@ class MDP(eqx.Module):
         if self.discount.ndim or not 0 <= self.discount <= 1:
             raise ValueError(f"discount is {self.discount} and must be one number in [0, 1]")
         if self.horizon is not None and (isinstance(self.horizon, bool) or self.horizon < 1):
-            raise ValueError(f"horizon is {self.horizon} and must be a number of actions, at least 1, or None for no end")
+            raise ValueError(
+                f"horizon is {self.horizon} and must be a number of actions, at least 1, or None for no end"
+            )
         if self.discount < 1 or self.horizon is not None:
             return
-        stuck = np.flatnonzero(~can_end(np.asarray(self.continuation).mean(1)))
+        stuck = np.flatnonzero(~can_end(self.transitions.mean(1), self.terminal))
         if len(stuck):
             raise ValueError(
-                f"discount 1 without a horizon gives endless sums: no terminal state can be reached from state {stuck[0]}; "
-                "lower the discount, set a horizon or mark a terminal state"
+                f"discount 1 without a horizon gives endless sums, because no terminal state can be reached from state "
+                f"{stuck[0]}: lower the discount, set a horizon or mark a terminal state"
             )
 
     @property
@@ -153,20 +165,21 @@ def _initial(initial: Table | int, terminal: np.ndarray) -> np.ndarray:
     if isinstance(initial, (int, np.integer)):
         if not 0 <= initial < states:
             raise ValueError(f"initial is state {initial} and there are {states}: give a state from 0 to {states - 1}")
-        initial = np.eye(states)[initial]
-    start = _as_floats(initial)
+    start = np.eye(states)[initial] if isinstance(initial, (int, np.integer)) else _as_floats(initial)
     if start.shape != (states,):
         raise ValueError(f"initial has shape {start.shape} for {states} states: give one probability for each state")
     check_distributions("initial", start)
     if start[terminal].any():
         state = np.flatnonzero(terminal & (start > 0))[0]
-        raise ValueError(f"initial gives probability {start[state]:g} to the terminal state {state}, where nothing can be done: "
-                         "start in a state that is not terminal")  # fmt: skip
+        raise ValueError(
+            f"initial gives probability {start[state]:g} to the terminal state {state}, where nothing can be done: "
+            "start in a state that is not terminal"
+        )
     return start
 
 
 class POMDP(eqx.Module):
-    """An MDP whose states are hidden: `emissions[s, z]` = O(z | s) is the distribution of what is seen in their place (item 1.2).
+    """An MDP whose states are hidden: O(z | s) = `emissions[s, z]` is what is seen in their place (item 1.2).
 
     Raises `ValueError` unless there is one distribution for each state.
     """
@@ -213,8 +226,9 @@ class TabularState(eqx.Module):
 class TabularEnv(Environment):
     """The environment of an `MDP` (observes the state) or a `POMDP` (observes o ~ O(· | s)); item 1.3.
 
-    Rewards are r(s, a), or r(s, a, s') where the MDP was built from those. `terminated` marks a terminal state or the horizon,
-    `truncated` is never set, and there are no extras. With O the identity a POMDP gives, bit for bit, what its MDP gives.
+    Rewards are r(s, a), or r(s, a, s') where the MDP was built from those. `terminated` marks a terminal state or the
+    horizon, `truncated` is never set, and there are no extras. With O the identity a POMDP gives, bit for bit, what
+    its MDP gives.
     """
 
     problem: MDP | POMDP
@@ -243,7 +257,8 @@ class TabularEnv(Environment):
         return spaces.Discrete(self.mdp.num_actions)
 
     def reset(self, key: PRNGKey) -> tuple[TabularState, Int[Array, ""]]:
-        # Two numbers even where nothing is emitted: the same states with and without observations, at no cost (threefry makes two).
+        # Two numbers even where nothing is emitted: the same states with and without observations, at no cost
+        # (threefry makes two at a time).
         uniform = jax.random.uniform(key, (2,), jnp.float32)
         state = draw(self.start_table, uniform[0])
         return TabularState(state, jnp.zeros((), jnp.int32)), self._observe(state, uniform[1])
@@ -271,9 +286,9 @@ def _reward(mdp: MDP, state: Array, action: Array, following: Array) -> Array:
 
 
 class TabularModel(Model):
-    """p(s' | s, a) of an MDP as a model to plan with: sample, probability, reward, end (item 1.7). States are their indices.
+    """p(s' | s, a) of an MDP as a model to plan with: sample, probability, reward, end (item 1.7).
 
-    The horizon is not part of it: a planner counts its own steps.
+    States are their indices. The horizon is not part of it: a planner counts its own steps.
     """
 
     mdp: MDP
@@ -300,5 +315,5 @@ class TabularModel(Model):
         return jnp.asarray(self.mdp.transitions)[state, action]
 
     def log_prob(self, state: Int[Array, ""], action: Int[Array, ""], next_state: Int[Array, ""]) -> Float[Array, ""]:
-        """log p(s' | s, a); -inf where it cannot happen."""
+        """The logarithm of p(s' | s, a); -inf where it cannot happen."""
         return jnp.log(self.probabilities(state, action)[next_state])

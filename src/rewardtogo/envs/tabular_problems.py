@@ -1,7 +1,7 @@
-"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, and a corridor of aliased states.
+"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, a corridor of aliased states.
 
-Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), example 13.1 (the corridor); Singh, Jaakkola and
-Jordan (1994) on why a memoryless policy may have to be stochastic there.
+Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), example 13.1 (the corridor);
+Singh, Jaakkola and Jordan (1994) on why a memoryless policy may have to be stochastic there.
 """
 
 import itertools
@@ -34,13 +34,15 @@ def random_mdp(
     num_terminal: int = 0,
     concentration: float = 1.0,
 ) -> MDP:
-    """A random MDP: Dirichlet transitions and starts, standard normal rewards; the last `num_terminal` states are terminal.
+    """A random MDP: Dirichlet transitions and starts, normal rewards; the last `num_terminal` states are terminal.
 
-    A small `concentration` makes the transitions nearly deterministic. Raises `ValueError` where no state would be left to act in.
+    A small `concentration` makes the transitions nearly deterministic. Raises `ValueError` where no state would be
+    left to act in.
     """
     if not 0 <= num_terminal < num_states:
         raise ValueError(
-            f"{num_terminal} of {num_states} states cannot be terminal: at least one must be left to start in, and none can be missing"
+            f"{num_terminal} of {num_states} states cannot be terminal: "
+            f"give a number from 0 to {num_states - 1}, so that one is left to start in"
         )
     rng = np.random.default_rng(seed)
     transitions = _dirichlet(rng, concentration, (num_states, num_actions, num_states))
@@ -50,7 +52,9 @@ def random_mdp(
     return MDP(transitions, rewards, initial, discount, np.arange(num_states) >= live, horizon)
 
 
-def random_policy(seed: int, num_states: int, num_actions: int, horizon: int | None = None) -> Float[np.ndarray, "... S A"]:
+def random_policy(
+    seed: int, num_states: int, num_actions: int, horizon: int | None = None
+) -> Float[np.ndarray, "... S A"]:
     """A random table of action probabilities `[S, A]`, or `[T, S, A]` for a `horizon`; every action is possible."""
     lead = () if horizon is None else (horizon,)
     return _dirichlet(np.random.default_rng(seed), 1.0, (*lead, num_states, num_actions))
@@ -65,15 +69,22 @@ def _dirichlet(rng: np.random.Generator, concentration: float, shape: tuple[int,
 def pacman(board: tuple[str, ...] = PACMAN_BOARD, *, discount: float = 0.95, slip: float = 0.0) -> MDP:
     """The notes' example of a hand-made reward, +1 for a dot and -100 for the ghost, on a small board (item 1.11).
 
-    - State: the square, and which dots are eaten: `dots_eaten * squares + square`, squares counted along the rows, dots as bits in
-      that order. The episode ends on a ghost or with the last dot.
+    - State: the square, and which dots are eaten: `dots_eaten * squares + square`, squares counted along the rows,
+      dots as bits in that order. The episode ends on a ghost or with the last dot.
     - Actions: `MOVES`. Walls and edges stop a move. With probability `slip` a uniformly random move is made instead.
 
     Raises `ValueError` for a board that is not a rectangle with one `P` and at least one dot.
     """
     squares = [square for row in board for square in row]
-    if len({len(row) for row in board}) != 1 or squares.count("P") != 1 or "." not in squares or set(squares) - set("P.G# "):
-        raise ValueError(f"the board {board!r} is not a rectangle of 'P', '.', 'G', '#' and ' ' with one 'P' and at least one '.'")
+    if (
+        len({len(row) for row in board}) != 1
+        or squares.count("P") != 1
+        or "." not in squares
+        or set(squares) - set("P.G# ")
+    ):
+        raise ValueError(
+            f"the board {board!r} is not a rectangle of 'P', '.', 'G', '#' and ' ' with one 'P' and at least one '.'"
+        )
     if not 0 <= slip <= 1:
         raise ValueError(f"slip is {slip} and must be a probability in [0, 1]")
     count, dots = len(squares), [i for i, square in enumerate(squares) if square == "."]
@@ -86,11 +97,10 @@ def pacman(board: tuple[str, ...] = PACMAN_BOARD, *, discount: float = 0.95, sli
         dot = 1 << dots.index(landing) if landing in dots else 0
         following = (eaten | dot) * count + landing
         outcomes[state, action, following] = 1
-        gains[state, action, following] = -100 if squares[landing] == "G" else float(dot and not eaten & dot)
+        gains[state, :, following] = -100 if squares[landing] == "G" else float(dot and not eaten & dot)
         terminal[state] = squares[square] == "G" or eaten == 2 ** len(dots) - 1
     transitions = (1 - slip) * outcomes + slip * outcomes.mean(1, keepdims=True)
-    return MDP(transitions, gains.max(1, keepdims=True) + gains.min(1, keepdims=True) + np.zeros_like(gains),
-               squares.index("P"), discount, terminal)  # fmt: skip
+    return MDP(transitions, gains, squares.index("P"), discount, terminal)
 
 
 def _move(board: tuple[str, ...], square: int, action: int) -> int:
@@ -104,8 +114,9 @@ def _move(board: tuple[str, ...], square: int, action: int) -> int:
 def aliased_corridor(*, discount: float = 1.0, horizon: int | None = None) -> POMDP:
     """Three squares and a goal that all look the same, and in the second of them left and right are swapped (item 1.6).
 
-    Every step costs 1. With the state in view the goal is 3 steps away; a memoryless policy that goes right with probability p
-    needs 2 (2 - p) / (p (1 - p)) steps, least at p = 2 - √2, where it is 6 + 4 √2 = 11.66, and for ever if it is deterministic.
+    Every step costs 1. With the state in view the goal is 3 steps away; a memoryless policy that goes right with
+    probability p needs 2 (2 - p) / (p (1 - p)) steps, least at p = 2 - √2, where it is 6 + 4 √2 = 11.66, and for ever
+    if it is deterministic.
     """
     left, right = 0, 1
     transitions = np.zeros((4, 2, 4))

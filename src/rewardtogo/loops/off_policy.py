@@ -58,6 +58,11 @@ class OffPolicy(Algorithm, Configured):
         wanted = -(-self.warm_up // self._block)
         return max(wanted, -(-self.length // self.unroll)) if self._sequential else wanted
 
+    @staticmethod
+    def default_num_envs() -> int:
+        """Environments side by side where nobody says how many."""
+        return 1
+
     @property
     def spec(self) -> EnvSpec:
         return env_spec(self.env)

@@ -31,6 +31,11 @@ class OnPolicy(Algorithm, Configured):
             raise ValueError(f"{type(self.learner).__name__} learns from {self.learner.batch}, not from fresh rollouts: "
                              "use OffPolicy (with environments) or Offline (with a dataset)")
 
+    @staticmethod
+    def default_num_envs() -> int:
+        """Environments side by side where nobody says how many."""
+        return 8
+
     @property
     def spec(self) -> EnvSpec:
         return env_spec(self.env)

@@ -73,13 +73,20 @@ class ActorCritic(eqx.Module):
             return flat(t.observation), flat(t.next_observation)
         return jax.vmap(one, in_axes=(0, 1, 1, 1), out_axes=1)(rollout.carry[1], t.observation, t.next_observation, t.done)
 
-    def replay(self, carry: Carry, observation: Observation, done: Bool[Array, "T"]) -> tuple[Distribution, Float[Array, "T"]]:
-        """Distributions and values of one environment's sequence `[T]`, from the memory before its first step."""
-        mask = action_mask(observation)
-        _, features = unroll(self.actor, carry[0], observation, done)
-        distribution = jax.vmap(lambda x, m: self.head(x, m))(features, mask)
-        _, features = unroll(self.critic, carry[1], observation, done)
-        return distribution, jax.vmap(lambda x: self.value_head(x)[0])(features)
+    def evaluate(self, carry: Carry, observation: Observation, action: Action, done: Bool[Array, "..."]) -> tuple[Array, Array, Array]:
+        """log pi(a|s), entropy and value of one step; with a memory, of one environment's sequence `[T]`, from the memory before
+        its first step and reset after each end."""
+        if not self.recurrent:
+            distribution, value = self.act(self.actor.init(), observation)[1], self.value(self.critic.init(), observation)[1]
+            return distribution.log_prob(action), distribution.entropy(), value
+
+        def one(actor_features: Array, critic_features: Array, mask: Array | None, action: Action) -> tuple[Array, Array, Array]:
+            distribution = self.head(actor_features, mask)
+            return distribution.log_prob(action), distribution.entropy(), self.value_head(critic_features)[0]
+
+        _, actor_features = unroll(self.actor, carry[0], observation, done)
+        _, critic_features = unroll(self.critic, carry[1], observation, done)
+        return jax.vmap(one)(actor_features, critic_features, action_mask(observation), action)
 
 
 class ActorCriticPolicy(Policy):

@@ -62,6 +62,11 @@ class Torso(eqx.Module):
 class Network(eqx.Module):
     """A recipe for a torso."""
 
+    @property
+    @abstractmethod
+    def has_memory(self) -> bool:
+        """Whether the torso will have one."""
+
     @abstractmethod
     def build(self, spec: Spec, key: PRNGKey) -> Torso:
         """A torso with fresh parameters for observations of this kind."""
@@ -88,6 +93,10 @@ class MLP(Network):
     def __init__(self, *sizes: int, activation: str = "tanh"):
         self.sizes = _sizes(sizes, "the sizes of an MLP")
         self.activation = _activation(activation)
+
+    @property
+    def has_memory(self) -> bool:
+        return False
 
     def build(self, spec: Spec, key: PRNGKey) -> "MLPTorso | CNNTorso":
         if has_images(spec):
@@ -137,6 +146,10 @@ class CNN(Network):
             raise ValueError(f"a CNN needs as many channels as kernels and strides, not {len(channels)}, {len(kernels)} and {len(strides)}")
         self.channels, self.kernels = _sizes(tuple(channels), "channels"), _sizes(tuple(kernels), "kernels")
         self.strides, self.sizes = _sizes(tuple(strides), "strides"), _sizes(tuple(sizes), "the dense sizes")
+
+    @property
+    def has_memory(self) -> bool:
+        return False
 
     def build(self, spec: Spec, key: PRNGKey) -> "CNNTorso":
         images = [(name, part) for name, part in input_parts(spec) if part.is_image]
@@ -214,6 +227,10 @@ class Custom(Network):
 
     def __init__(self, module: Any):
         self.module, self.static = eqx.partition(module, eqx.is_array) if isinstance(module, eqx.Module) else (None, module)
+
+    @property
+    def has_memory(self) -> bool:
+        return False
 
     def build(self, spec: Spec, key: PRNGKey) -> "CustomTorso":
         built = isinstance(self.static, eqx.Module)

@@ -20,6 +20,10 @@ class GRU(Network):
     def __init__(self, size: int = 64, encoder: Network | None = None):
         self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
 
+    @property
+    def has_memory(self) -> bool:
+        return True
+
     def build(self, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
         return _build("gru", 3, self.size, self.encoder, spec, key)
 
@@ -32,6 +36,10 @@ class LSTM(Network):
 
     def __init__(self, size: int = 64, encoder: Network | None = None):
         self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
+
+    @property
+    def has_memory(self) -> bool:
+        return True
 
     def build(self, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
         return _build("lstm", 4, self.size, self.encoder, spec, key)

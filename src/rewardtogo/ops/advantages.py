@@ -40,8 +40,8 @@ def gae_weights(lambda_: ScalarLike, length: int) -> Float[Array, "T"]:
 
     w_n = (1 - lambda) lambda^(n-1), and lambda^(length-1) for the last, which stands for all longer ones: the sum is 1.
     """
-    powers = jnp.asarray(lambda_, float) ** jnp.arange(length)
-    return powers * jnp.where(jnp.arange(length) == length - 1, 1.0, 1.0 - jnp.asarray(lambda_, float))
+    chance, steps = jnp.asarray(lambda_, float), jnp.arange(length)
+    return chance ** steps.astype(chance.dtype) * jnp.where(steps == length - 1, 1.0, 1.0 - chance)
 
 
 def n_step_advantages(

@@ -25,12 +25,9 @@ from jax.core import Tracer
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int8, Int32, Integer, Key
 
-HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+from .quadrature import log_det_tanh, mean_log_det_tanh
 
-# Quadratures behind `TanhGaussian.entropy`: Hermite for E[f(z)], z ~ N(0, 1); Legendre for the integral over (0, 9).
-_HERMITE_Z, _HERMITE_W = np.polynomial.hermite_e.hermegauss(32)
-_HERMITE_W = _HERMITE_W / math.sqrt(2.0 * math.pi)
-_LEGENDRE_U, _LEGENDRE_W = (np.polynomial.legendre.leggauss(32) + np.array([[1.0], [0.0]])) * 4.5
+HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Distribution(eqx.Module):
@@ -117,7 +114,7 @@ class Categorical(Distribution):
 
 
 class MultiCategorical(Distribution):
-    """Independent entries with `counts[i]` choices each, their logits one after another. Samples are int32 of `shape`."""
+    """Independent entries, `counts[i]` choices for entry i, logits one after another. Samples are int32 of `shape`."""
 
     logits: Float[Array, "L"]
     counts: tuple[int, ...] = eqx.field(static=True)
@@ -292,29 +289,6 @@ class FullGaussian(Distribution):
         return jnp.sum(jnp.log(jnp.diagonal(self.scale)))
 
 
-def _log_det_tanh(u: Array) -> Array:
-    return 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u))
-
-
-def _mean_log_det_tanh(mean: Array, std: Array) -> Array:
-    """E[log(1 - tanh(u)^2)], u ~ N(mean, std^2), by the quadrature that suits the width (error below 1e-6)."""
-    narrow = std <= 1.0
-    flat, column = lambda x: x.reshape(-1, 1), lambda x: jnp.asarray(x[None, :], mean.dtype)
-    small, large = jnp.where(narrow, std, 1.0), jnp.where(narrow, 1.0, std)  # each branch is finite, gradients too
-    by_hermite = _log_det_tanh(flat(mean) + flat(small) * jnp.asarray(_HERMITE_Z, mean.dtype)[None, :]) * column(
-        _HERMITE_W
-    )
-    # Wide: -2|u| has a closed expectation (the folded normal), and the rest is a bump of width 1 about 0.
-    z = mean / large
-    folded = large * math.sqrt(2.0 / math.pi) * jnp.exp(-0.5 * z * z) + mean * jax.scipy.special.erf(z / math.sqrt(2.0))
-    u, weight = column(_LEGENDRE_U), column(_LEGENDRE_W)
-    density = sum(jnp.exp(-0.5 * jnp.square((sign * u - flat(mean)) / flat(large))) for sign in (1.0, -1.0))
-    bump = jnp.sum(jnp.log1p(jnp.exp(-2.0 * u)) * density * weight, axis=1).reshape(mean.shape)
-    bump = bump / (large * math.sqrt(2.0 * math.pi))
-    by_parts = 2.0 * (math.log(2.0) - folded - bump)
-    return jnp.where(narrow, jnp.sum(by_hermite, axis=1).reshape(mean.shape), by_parts)
-
-
 class TanhGaussian(Distribution):
     """A Gaussian squashed into the box: a = centre + half * tanh(u), u ~ N(mean, exp(log_std)^2), sums over all axes.
 
@@ -342,16 +316,16 @@ class TanhGaussian(Distribution):
         """By quadrature with fixed nodes, since there is no closed form; the error is below 1e-5 per entry."""
         log_half = jnp.broadcast_to(jnp.log(self._half()), self.mean.shape)
         gaussian = self.log_std + (0.5 + HALF_LOG_2PI)
-        return jnp.sum(gaussian + log_half + _mean_log_det_tanh(self.mean, jnp.exp(self.log_std)))
+        return jnp.sum(gaussian + log_half + mean_log_det_tanh(self.mean, jnp.exp(self.log_std)))
 
     def mode(self) -> Float[Array, "..."]:
         return self._squash(self.mean)
 
     def kl(self, other: "TanhGaussian") -> Float[Array, ""]:
         """Equal to the KL of the Gaussians, as the squashing cancels; both laws must have the same bounds."""
-        bounds = (self.low, other.low), (self.high, other.high)
-        for mine, theirs in bounds:
-            if not isinstance(mine, Tracer) and not isinstance(theirs, Tracer) and np.any(mine != theirs):
+        for mine, theirs in ((self.low, other.low), (self.high, other.high)):
+            known = not isinstance(mine, Tracer) and not isinstance(theirs, Tracer)
+            if known and np.any(np.asarray(mine) != np.asarray(theirs)):
                 raise ValueError(
                     f"the KL of squashed Gaussians needs equal bounds, not {mine} and {theirs}: use one action space"
                 )
@@ -366,7 +340,7 @@ class TanhGaussian(Distribution):
 
     def _log_prob_before(self, before: Array) -> Array:
         log_half = jnp.broadcast_to(jnp.log(self._half()), self.mean.shape)
-        return _normal_log_prob(before, self.mean, self.log_std) - jnp.sum(log_half + _log_det_tanh(before))
+        return _normal_log_prob(before, self.mean, self.log_std) - jnp.sum(log_half + log_det_tanh(before))
 
     def _centre(self) -> Array:
         return 0.5 * (self.low + self.high)

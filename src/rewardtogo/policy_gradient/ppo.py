@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..core import Action, Carry, EnvSpec, Learner, Number, Observation, PRNGKey, Rollout, number, part, require_action, setting, value_at
 from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Network, RunningNorm, as_network
 from ..ops.advantages import gae, normalise
+from ..ops.metrics import explained_variance
 
 
 class PPOState(eqx.Module):
@@ -117,16 +118,7 @@ class PPO(Learner):
         return eqx.tree_at(lambda s: s.carry, steps, rollout.carry), value
 
     def _loss(self, network: ActorCritic, s: Samples, epsilon: Array, entropy_cost: Array) -> tuple[Array, dict[str, Array]]:
-        def one(observation: Observation, action: Action, done: Array, carry: Carry) -> tuple[Array, Array, Array]:
-            if network.recurrent:
-                distribution, value = network.replay(carry, observation, done)
-                read = jax.vmap(lambda d, a: (d.log_prob(a), d.entropy()))
-                return *read(distribution, action), value
-            distribution = network.act(network.init()[0], observation)[1]
-            value = network.value(network.init()[1], observation)[1]
-            return distribution.log_prob(action), distribution.entropy(), value
-
-        log_prob, entropy, value = jax.vmap(one)(s.observation, s.action, s.done, s.carry)
+        log_prob, entropy, value = jax.vmap(network.evaluate)(s.carry, s.observation, s.action, s.done)
         advantage = normalise(s.advantage) if self.normalise_advantages else s.advantage
         log_ratio = log_prob - s.log_prob
         ratio = jnp.exp(log_ratio)
@@ -153,9 +145,3 @@ class PPO(Learner):
             raise ValueError(f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
                              f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}")
         return size // self.minibatches
-
-
-def explained_variance(value: Float[Array, "..."], target: Float[Array, "..."]) -> Float[Array, ""]:
-    """1 - Var(target - value) / Var(target): 1 is a perfect critic, 0 one that knows nothing. 0 where targets do not vary."""
-    spread = jnp.var(target)
-    return jnp.where(spread > 0, 1.0 - jnp.var(target - value) / jnp.where(spread > 0, spread, 1.0), 0.0)

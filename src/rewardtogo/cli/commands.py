@@ -1,0 +1,252 @@
+"""What each command does; imported only when one is run, because it loads JAX."""
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ..catalogue import LOOPS, algorithm_row
+from ..core import Schedule
+from ..envs.gymnasium import EnvironmentFailure
+from ..ops.schedules import to_text
+from ..runner.config import PARTS, merge, options, resolve
+from ..runner.engine import NonFinite
+from ..runner.train import Interrupted, Run, resume, train
+from .main import INTERRUPTED, WRONG, RequestError, _say
+
+
+def cache_folder() -> Path:
+    """Where compiled programs are kept between commands (`RTG_CACHE`, or the user's cache folder)."""
+    base = os.environ.get("RTG_CACHE") or os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return Path(base or Path.home() / ".cache") / "rewardtogo"
+
+
+def use_cache() -> None:
+    """Keep compiled programs: a second run of the same shapes starts in a fraction of the time."""
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def perform(name: str, given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> int:
+    """Run one command; its exit status."""
+    use_cache()
+    try:
+        COMMANDS[name](given, groups)
+    except (Interrupted, KeyboardInterrupt) as stop:
+        return _say(str(stop) or "interrupted", INTERRUPTED)
+    except (NonFinite, EnvironmentFailure) as error:
+        return _say(str(error), 1)
+    except ValueError as error:
+        if isinstance(error, json.JSONDecodeError):
+            raise
+        return _say(str(error), WRONG)
+    except OSError as error:
+        return _say(f"{error.strerror or error}{f' ({error.filename})' if error.filename else ''}: "
+                    "what was written before is whole; free some space or choose another folder", 1)
+    return 0
+
+
+def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    file = _config_file(given.config) if given.config else {}
+    extra = {"learner": merge(file.get("learner", {}), groups["learner"]), "loop": merge(file.get("loop", {}), groups["loop"]),
+             "env_kwargs": {**file.get("env", {}), **{k: _value(v) for k, v in groups["env"].items()}}}
+    found = train(
+        given.algorithm, given.env, steps=_whole(given.steps, file.get("steps")), seed=given.seed, num_seeds=given.num_seeds,
+        num_envs=given.num_envs if given.num_envs is not None else file.get("num_envs"), out=given.out, backend=given.backend,
+        preset=given.preset, data=given.data, command=["rtg", *given.arguments], **extra, **_limits(given))
+    _report(given, found)
+    if given.profile:
+        from ..runner.profile import profile
+
+        for run in found if isinstance(found, list) else [found]:
+            print(profile(run.path), file=sys.stderr)
+
+
+def _config_file(path: str) -> dict[str, Any]:
+    """Options from a JSON file; a run's config.json will do."""
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RequestError(f"there is no configuration file {path}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RequestError(f"the configuration file {path} is not JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise RequestError(f"the configuration file {path} must hold an object with learner, loop, env, steps or num_envs")
+    if "format" in data:
+        env = data.get("env", {})
+        data = {"learner": _without_class(data["learner"]), "loop": _without_class(data["loop"]), "steps": data.get("steps"),
+                "env": env.get("kwargs", {}), "num_envs": env.get("num_envs")}
+    unknown = set(data) - {"learner", "loop", "env", "steps", "num_envs"}
+    if unknown:
+        raise RequestError(f"the configuration file {path} has an unknown entry {sorted(unknown)[0]!r}: known are learner, loop, env, steps, num_envs")
+    return data
+
+
+def _without_class(data: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in data.items() if name != "class"}
+
+
+def _limits(given: argparse.Namespace) -> dict[str, Any]:
+    sinks = [name for name in ("tensorboard", "wandb") if vars(given)[name]]
+    return {"stop_at_return": given.stop_at_return, "time_limit": given.time_limit, "checkpoint_every": given.checkpoint_every,
+            "sinks": sinks, "quiet": given.quiet}
+
+
+def _whole(steps: float | None, other: Any = None) -> Any:
+    if steps is None:
+        return other
+    if steps == steps and abs(steps) != float("inf") and steps != int(steps):
+        raise RequestError(f"the number of steps must be a whole number, not {steps:g}")
+    return int(steps) if steps == steps and abs(steps) != float("inf") else steps
+
+
+def _value(text: Any) -> Any:
+    if not isinstance(text, str):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _report(given: argparse.Namespace, found: Run | list[Run]) -> None:
+    if not given.json:
+        return
+    runs = found if isinstance(found, list) else [found]
+    data = [{"run": str(run.path), **(run.evaluation or {})} for run in runs]
+    print(json.dumps(data[0] if isinstance(found, Run) else {"runs": data}))
+
+
+def _resume(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    learner = _learner_for(given.run, given.learner_class)
+    _report(given, resume(given.run, steps=_whole(given.steps), learner=learner, **_limits(given)))
+
+
+def _learner_for(run: str, path: str | None) -> Any:
+    """The learner of a run that is not part of the library, from the class that the user names."""
+    if path is None:
+        return None
+    from ..runner.config import build
+    from ..runner.folder import RunFolder
+
+    return build(resolve(path), RunFolder(run).config()["learner"])
+
+
+def _eval(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.evaluate_run import evaluate_run
+
+    found = evaluate_run(given.run, episodes=given.episodes, env=given.env, backend=given.backend, checkpoint=given.checkpoint,
+                         stochastic=given.stochastic, seed=given.seed, learner=_learner_for(given.run, given.learner_class))
+    if given.json:
+        print(json.dumps(found))
+        return
+    low, high = found["return_ci95"]
+    print(f"return {found['return_mean']:.2f} [{low:.2f}, {high:.2f}] (sd {found['return_std']:.2f}) over {found['episodes']} episodes "
+          f"of {found['length_mean']:.1f} steps")
+
+
+def _play(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.play import play
+
+    path, total, length = play(given.run, out=given.out, seed=given.seed, checkpoint=given.checkpoint, stochastic=given.stochastic)
+    print(f"{path}   return {total:.1f} in {length} steps")
+
+
+def _plot(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.plot import draw_curves
+
+    print(draw_curves(given.runs, given.out or "curves.png"))
+
+
+def _compare(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.compare import compare, table
+
+    found = compare(given.runs)
+    print(json.dumps(found) if given.json else table(found))
+
+
+def _check_env(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.check import check_by_name
+
+    problems = check_by_name(given.env)
+    if given.json:
+        print(json.dumps([dataclasses.asdict(p) for p in problems]))
+    else:
+        for problem in problems:
+            print(problem)
+        errors = sum(p.severity == "error" for p in problems)
+        print(f"{given.env}: " + ("nothing wrong" if not problems else f"{errors} errors, {len(problems) - errors} warnings"))
+    if any(p.severity == "error" for p in problems):
+        raise RequestError(f"{given.env} cannot be used as it is")
+
+
+def _collect(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.collect import collect_demonstrations
+
+    path, found = collect_demonstrations(given.run, episodes=given.episodes, out=given.out, deterministic=not given.stochastic, seed=given.seed)
+    print(json.dumps({"dataset": str(path), **found}) if given.json else f"{path}   {found}")
+
+
+def _export(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..runner.export import export
+
+    print(export(given.run, format=given.format, out=given.out, checkpoint=given.checkpoint))
+
+
+def _figure(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    del groups
+    from ..figures import FIGURES, draw
+
+    if given.id is None:
+        for name, (_, text) in FIGURES.items():
+            print(f"{name:<6}{text}")
+        return
+    print(draw(given.id, given.out, given.seed))
+
+
+def show_options(algorithm: str) -> None:
+    """Print every hyperparameter of an algorithm and of its loop: default, range, meaning."""
+    cls = resolve(algorithm if ":" in algorithm else algorithm_row(algorithm).path)
+    loop = resolve(LOOPS[algorithm_row(algorithm).loop]) if ":" not in algorithm else None
+    for title, owner in (("learner", cls), ("loop", loop)):
+        if owner is None:
+            continue
+        print(f"\n{title} ({owner.__name__}):")
+        for name, field in options(owner).items():
+            span = field.metadata.get("range")
+            limits = f"  {span}" if span is not None and str(span) != "(-inf, inf)" else ""
+            print(f"  --{title}.{name.replace('_', '-')} {_shown(field.default)}{limits}\n      {field.metadata['doc']}")
+            if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
+                for inner in options(type(field.default)):
+                    print(f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(field.default, inner))}")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Schedule):
+        return to_text(value)
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    if dataclasses.is_dataclass(value):
+        return type(value).__name__.lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+COMMANDS = {
+    "train": _train, "resume": _resume, "eval": _eval, "play": _play, "plot": _plot, "compare": _compare, "check-env": _check_env,
+    "collect": _collect, "export": _export, "figure": _figure,
+}

@@ -1,0 +1,232 @@
+"""The command `rtg`. Help and lists import no JAX; every wrong request ends with one sentence on stderr and status 2."""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from ..catalogue import ALGORITHMS, ENVIRONMENTS, nearest
+
+INTERRUPTED, WRONG = 130, 2
+
+
+class RequestError(Exception):
+    """A request that cannot be met, in one sentence."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An `argparse` parser whose complaints are one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        raise RequestError(message)
+
+
+def _number(text: str) -> float:
+    return float(text.replace("_", ""))
+
+
+def _parsers() -> tuple[Parser, dict[str, Parser]]:
+    main = Parser(prog="rtg", description="Deep reinforcement learning, compiled: train, resume, evaluate, watch, compare, export.")
+    main.add_argument("--version", action="store_true", help="print the version and leave")
+    commands = main.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
+    table: dict[str, Parser] = {}
+
+    def command(name: str, summary: str, **keywords: Any) -> Parser:
+        table[name] = commands.add_parser(name, help=summary, description=summary, allow_abbrev=False, **keywords)
+        return table[name]
+
+    def run_argument(parser: Parser) -> None:
+        parser.add_argument("run", metavar="RUN", help="a run folder")
+
+    def limits(parser: Parser) -> None:
+        parser.add_argument("--steps", type=_number, help="environment steps (gradient steps offline)")
+        parser.add_argument("--stop-at-return", type=float, metavar="R", help="stop when an evaluation reaches this return")
+        parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after so many seconds of training")
+        parser.add_argument("--checkpoint-every", type=float, default=60.0, metavar="SECONDS", help="default 60")
+        parser.add_argument("--tensorboard", action="store_true", help="also write TensorBoard events")
+        parser.add_argument("--wandb", action="store_true", help="also log to Weights & Biases")
+        parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+        parser.add_argument("--json", action="store_true", help="one JSON object as the last line of stdout")
+
+    p = command("train", "train an algorithm in an environment", epilog="`rtg train ALGORITHM ENV --help` shows the algorithm's own options")
+    p.add_argument("algorithm", metavar="ALGORITHM", help="a name from `rtg list`, or module:Class")
+    p.add_argument("env", metavar="ENV", nargs="?", help="a Gymnasium id (module:Id included) or one of `rtg list --envs`")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--num-seeds", type=int, default=1, metavar="K", help="train K seeds in one program, one folder each")
+    p.add_argument("--num-envs", type=int, metavar="B", help="environments side by side")
+    p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
+    p.add_argument("--backend", default="auto", help="auto, jax (compiled twin) or gymnasium")
+    p.add_argument("--preset", default="auto", metavar="NAME|none", help="hyperparameters known to work (default: those of the pair)")
+    p.add_argument("--config", metavar="FILE", help="a JSON file with learner, loop, env and other options, such as a run's config.json")
+    p.add_argument("--data", metavar="DATASET", help="a dataset to learn from, made by `rtg collect`")
+    p.add_argument("--profile", action="store_true", help="afterwards, say what share of the time collection, learning and evaluation take")
+    limits(p)
+    p = command("resume", "continue a run from its last checkpoint")
+    run_argument(p)
+    p.add_argument("--learner-class", metavar="MODULE:CLASS", help="the learner of a run that is not part of the library")
+    limits(p)
+    p = command("eval", "play whole episodes and print the mean return with its confidence interval")
+    run_argument(p)
+    p.add_argument("--episodes", type=int, default=100, metavar="N")
+    p.add_argument("--env", metavar="ENV", help="another environment than the one trained in")
+    p.add_argument("--backend", default=None, help="auto, jax or gymnasium (default: the run's)")
+    p.add_argument("--checkpoint", default="last", metavar="best|last|N")
+    p.add_argument("--stochastic", action="store_true", help="sample actions")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--learner-class", metavar="MODULE:CLASS")
+    p.add_argument("--json", action="store_true")
+    p = command("play", "render an episode to a GIF or an MP4")
+    run_argument(p)
+    p.add_argument("--out", metavar="FILE.gif|FILE.mp4", help="default RUN/episode.gif")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--checkpoint", default="last", metavar="best|last")
+    p.add_argument("--stochastic", action="store_true")
+    p = command("plot", "draw learning curves, several seeds as a mean with a band")
+    p.add_argument("runs", nargs="+", metavar="RUN")
+    p.add_argument("--out", metavar="FILE.png|.svg", help="default curves.png")
+    p = command("compare", "compare runs by algorithm and environment: interquartile means, bootstrap intervals")
+    p.add_argument("runs", nargs="+", metavar="RUN")
+    p.add_argument("--json", action="store_true")
+    p = command("list", "every algorithm: chapter, number in the notes, spaces it can use")
+    p.add_argument("--envs", action="store_true", help="the compiled environments instead")
+    p.add_argument("--json", action="store_true")
+    p = command("check-env", "say what is wrong with an environment, and the mend")
+    p.add_argument("env", metavar="ENV")
+    p.add_argument("--json", action="store_true")
+    p = command("collect", "play demonstrations with a trained policy into a dataset")
+    run_argument(p)
+    p.add_argument("--episodes", type=int, default=10, metavar="N")
+    p.add_argument("--out", metavar="DATASET")
+    p.add_argument("--stochastic", action="store_true", help="sample actions")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--json", action="store_true")
+    p = command("export", "write the policy for use without this library")
+    run_argument(p)
+    p.add_argument("--format", default="stablehlo", help="stablehlo")
+    p.add_argument("--out", metavar="FILE", help="default RUN/policy.stablehlo")
+    p.add_argument("--checkpoint", default="last", metavar="best|last")
+    p = command("figure", "redraw a figure or experiment of the notes")
+    p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
+    p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
+    p.add_argument("--seed", type=int, default=0)
+    return main, table
+
+
+def _nested(pairs: Sequence[str], groups: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """`--learner.network.sizes 64 64 --env.x 1` as nested dictionaries by group."""
+    found: dict[str, dict[str, Any]] = {group: {} for group in groups}
+    i = 0
+    while i < len(pairs):
+        word = pairs[i]
+        path, equals, value = word[2:].partition("=")
+        steps = path.replace("-", "_").split(".")
+        if not word.startswith("--"):
+            raise RequestError(f"what is {word!r} for? Options are written --name value; see --help")
+        if steps[0] not in groups or len(steps) < 2:
+            known = [a for action in _parsers()[1]["train"]._actions for a in action.option_strings]
+            raise RequestError(f"there is no option {word.partition('=')[0]!r}: "
+                               f"{nearest(word, [*known, '--learner.NAME', '--loop.NAME', '--env.NAME'])} Options of the algorithm are --learner.NAME")
+        i += 1
+        values = [value] if equals else []
+        while not equals and i < len(pairs) and not (pairs[i].startswith("--") and len(pairs[i]) > 2):
+            values.append(pairs[i])
+            i += 1
+        if not values:
+            raise RequestError(f"the option {word} needs a value")
+        place = found[steps[0]]
+        for step in steps[1:-1]:
+            old = place.get(step)
+            place[step] = old if isinstance(old, dict) else {} if old is None else {"class": old}
+            place = place[step]
+        old = place.get(steps[-1])
+        place[steps[-1]] = {**old, "class": " ".join(values)} if isinstance(old, dict) else " ".join(values)
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser, table = _parsers()
+    try:
+        return _dispatch(parser, table, arguments)
+    except RequestError as error:
+        return _say(str(error), WRONG)
+    except KeyboardInterrupt as error:
+        return _say(str(error) or "interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        # Whoever read our output has gone; nothing more can be said to them.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _say(sentence: str, status: int) -> int:
+    print(f"rtg: {' '.join(sentence.split())}", file=sys.stderr)
+    return status
+
+
+def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        parser.print_help()
+        return 0
+    if arguments[0] == "--version":
+        from .. import __version__
+
+        print(__version__)
+        return 0
+    if arguments[0] not in table:
+        raise RequestError(f"there is no command {arguments[0]!r}: {nearest(arguments[0], table)}")
+    groups: dict[str, dict[str, Any]] = {}
+    if arguments[0] == "train":
+        if any(a in ("-h", "--help") for a in arguments):
+            table["train"].print_help()
+            names = [a for a in arguments[1:] if not a.startswith("-")]
+            if names and (names[0] in ALGORITHMS or ":" in names[0]):
+                from .commands import show_options
+
+                show_options(names[0])
+            return 0
+        options, rest = table["train"].parse_known_args(arguments[1:])
+        groups = _nested(rest, ("learner", "loop", "env"))
+    else:
+        options = _known(table[arguments[0]], arguments[1:])
+    options.arguments = arguments
+    if arguments[0] == "list":
+        return _list(options)
+    from .commands import perform
+
+    return perform(arguments[0], options, groups)
+
+
+def _known(parser: Parser, arguments: list[str]) -> argparse.Namespace:
+    options, rest = parser.parse_known_args(arguments)
+    if rest:
+        known = [a for action in parser._actions for a in action.option_strings]
+        raise RequestError(f"there is no option {rest[0]!r} here: {nearest(rest[0], known)}" if rest[0].startswith("-")
+                           else f"what is {rest[0]!r} for? See {parser.prog} --help")
+    return options
+
+
+def _list(options: argparse.Namespace) -> int:
+    if options.envs:
+        if options.json:
+            print(json.dumps(ENVIRONMENTS))
+            return 0
+        width = max(map(len, ENVIRONMENTS))
+        for name, text in ENVIRONMENTS.items():
+            print(f"{name:<{width}}  {text}")
+        print("\nBesides these, every Gymnasium id, module:Id included (`python -c 'import gymnasium; gymnasium.pprint_registry()'` lists them).")
+        return 0
+    if options.json:
+        print(json.dumps({row.name: {"chapter": row.chapter, "number": row.number, "loop": row.loop, "actions": row.actions,
+                                     "summary": row.summary} for row in ALGORITHMS.values()}))
+        return 0
+    print(f"{'name':<11}{'chapter':<9}{'number':<8}{'actions':<30}summary")
+    for row in ALGORITHMS.values():
+        print(f"{row.name:<11}{row.chapter:<9}{row.number:<8}{'any' if len(row.actions) == 4 else ', '.join(row.actions):<30}{row.summary}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,81 @@
+"""`make`: any environment, by name or as an object, as B environments side by side."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import gymnasium
+
+from ..catalogue import ENVIRONMENTS, nearest
+from ..core import Environment, VectorEnv
+from .acrobot import Acrobot
+from .cartpole import CartPole
+from .gymnasium import GymnasiumEnv
+from .mountain_car import MountainCar, MountainCarContinuous
+from .pendulum import Pendulum
+from .probes import OneStep, RecallProbe, TruncatedLoop
+from .time_limit import TimeLimit
+from .vectorize import vectorize
+from .wrappers import MaskObservation
+
+Backend = Literal["auto", "jax", "gymnasium"]
+BACKENDS = ("auto", "jax", "gymnasium")
+
+COMPILED: dict[str, Callable[[], Environment]] = {
+    "CartPole-v1": lambda: TimeLimit(CartPole(), 500),
+    "CartPoleNoVel-v1": lambda: TimeLimit(MaskObservation(CartPole(), keep=(0, 2)), 500),
+    "Acrobot-v1": lambda: TimeLimit(Acrobot(), 500),
+    "MountainCar-v0": lambda: TimeLimit(MountainCar(), 200),
+    "MountainCarContinuous-v0": lambda: TimeLimit(MountainCarContinuous(), 999),
+    "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
+    "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
+    "OneStep": OneStep,
+    "TruncatedLoop": TruncatedLoop,
+    "RecallProbe": RecallProbe,
+}
+"""Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
+
+
+def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **kwargs: Any) -> VectorEnv:
+    """B environments side by side.
+
+    - `env`: a Gymnasium id (`module:Id` included), one of ours (`rtg list --envs`), a function that makes an environment, a
+      `core.Environment`, or a `VectorEnv` (given back as it is).
+    - `num_envs`: B, 1 if not given.
+    - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"auto"` for the twin where there is one.
+    - `kwargs`: go to `gymnasium.make`; an environment with arguments is Gymnasium's own.
+
+    Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"there is no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
+    if isinstance(env, VectorEnv):
+        if num_envs not in (None, env.num_envs):
+            raise ValueError(f"this environment already has {env.num_envs} copies: leave num_envs out, or give one that has {num_envs}")
+        return env
+    if isinstance(env, Environment):
+        return vectorize(env, num_envs or 1)
+    if isinstance(env, str):
+        return _by_name(env, 1 if num_envs is None else num_envs, backend, kwargs)
+    if callable(env) and not isinstance(env, gymnasium.Env):
+        made = env(**kwargs)
+        if isinstance(made, (Environment, VectorEnv)):
+            return make(made, num_envs)
+        if isinstance(made, gymnasium.Env):
+            made.close()
+    return GymnasiumEnv(env, num_envs or 1, kwargs=kwargs)
+
+
+def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any]) -> VectorEnv:
+    if num_envs < 1:
+        raise ValueError(f"there must be at least one environment, not {num_envs}")
+    if name in COMPILED and backend != "gymnasium" and not kwargs:
+        return vectorize(COMPILED[name](), num_envs)
+    if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
+        raise ValueError(f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out")
+    if backend == "jax":
+        raise ValueError(f"{name} has no compiled twin: use --backend gymnasium, or one of {', '.join(sorted(COMPILED))}")
+    if name not in gymnasium.registry and ":" not in name:
+        if name in COMPILED:
+            raise ValueError(f"{name} is not one of Gymnasium's environments: use --backend jax")
+        raise ValueError(f"there is no environment {name!r}: {nearest(name, [*gymnasium.registry, *ENVIRONMENTS])}")
+    return GymnasiumEnv(name, num_envs, kwargs=kwargs)

@@ -1,0 +1,35 @@
+"""Public oracles on tabular problems in float64: enumeration, dynamic programming, distributions, beliefs, sampling."""
+
+from .beliefs import belief_update as belief_update
+from .beliefs import initial_belief as initial_belief
+from .chains import MarkovTest as MarkovTest
+from .chains import chain_distributions as chain_distributions
+from .chains import chi_square_tail as chi_square_tail
+from .chains import discounted_occupancy as discounted_occupancy
+from .chains import markov_test as markov_test
+from .chains import simulate_chain as simulate_chain
+from .chains import state_distributions as state_distributions
+from .chains import stationary_distribution as stationary_distribution
+from .dynamic_programming import discounted_system as discounted_system
+from .dynamic_programming import expected_return as expected_return
+from .dynamic_programming import horizon_of as horizon_of
+from .dynamic_programming import induced_chain as induced_chain
+from .dynamic_programming import optimal_policy as optimal_policy
+from .dynamic_programming import optimal_q_values as optimal_q_values
+from .dynamic_programming import q_values as q_values
+from .dynamic_programming import v_values as v_values
+from .enumeration import best_deterministic_policy as best_deterministic_policy
+from .enumeration import enumerate_trajectories as enumerate_trajectories
+from .enumeration import enumerated_return as enumerated_return
+from .enumeration import trajectory_log_prob as trajectory_log_prob
+from .monte_carlo import Estimate as Estimate
+from .monte_carlo import monte_carlo_return as monte_carlo_return
+from .monte_carlo import simulate as simulate
+from .policies import TablePolicy as TablePolicy
+from .policies import check_policy as check_policy
+from .policies import greedy_policy as greedy_policy
+from .policies import memoryless_policy as memoryless_policy
+from .policies import one_hot_policy as one_hot_policy
+from .trajectories import Trajectories as Trajectories
+from .trajectories import join_episodes as join_episodes
+from .trajectories import split_episodes as split_episodes

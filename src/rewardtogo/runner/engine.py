@@ -1,0 +1,268 @@
+"""Training an `Algorithm`: one compiled program for any number of iterations, called in chunks of about a second.
+
+Everything that is not mathematics happens between chunks: progress, metrics, checkpoints, evaluation, callbacks, interrupts, checks
+for NaN. Where a chunk ends does not show in any result: rows of metrics end at fixed iterations, and iteration i always uses
+`fold_in(key, i)`, which makes resuming exact.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from ..core import Algorithm, Episodes, State
+from ..envs.gymnasium import EnvironmentFailure, failure_of, hosted
+
+ROWS_PER_CHUNK = 128
+"""Rows of metrics that one call of the program can give back."""
+LARGE = 2**20
+"""Bytes from which an array is donated to the program, so that it is changed in place (a replay). Donating everything would lose
+the state with a chunk that fails, and not donating small arrays costs nothing to speak of."""
+
+
+class NonFinite(RuntimeError):
+    """A loss or a parameter is no longer a number."""
+
+
+@dataclasses.dataclass
+class Moment:
+    """What a callback sees between two chunks.
+
+    `state` is the algorithm's (with a leading axis of seeds where several train at once), `rows` are the rows of metrics finished
+    since the last moment, `iteration` counts finished iterations, `seconds` is the time spent training, without compilation, evaluation and callbacks.
+    """
+
+    algorithm: Algorithm
+    state: State
+    sums: Array
+    iteration: int
+    iterations: int
+    rows: list[dict[str, Any]]
+    seconds: float
+    compile_seconds: float
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps so far (gradient steps offline)."""
+        return steps_after(self.algorithm, self.iteration)
+
+
+Callback = Callable[[Moment], bool | None]
+
+
+@dataclasses.dataclass
+class Every:
+    """A callback that must be called exactly after every `iterations` iterations; others are called between any two chunks."""
+
+    iterations: int
+    callback: Callback
+
+
+def steps_after(algorithm: Algorithm, iteration: int) -> int:
+    """Environment steps taken after so many iterations, warm-up included."""
+    return algorithm.initial_steps + iteration * algorithm.steps_per_iteration
+
+
+def iterations_for(algorithm: Algorithm, steps: int) -> int:
+    """The whole number of iterations that takes at least `steps` steps, and at least one."""
+    return max(1, math.ceil((steps - algorithm.initial_steps) / algorithm.steps_per_iteration))
+
+
+class Program:
+    """The compiled functions of one algorithm: `init`, `advance` by any number of iterations, and `check` for NaN.
+
+    `key` has shape `()`, or `[K]` to train K seeds at once: then every array of the state has a leading axis `K`.
+    """
+
+    def __init__(self, algorithm: Algorithm, key: Key[Array, "..."], row_every: int):
+        self.algorithm, self.key, self.row_every = algorithm, key, row_every
+        self.batched = key.ndim == 1
+        if self.batched and hosted(algorithm):
+            raise ValueError("several seeds cannot share one compiled program with a Gymnasium environment: train them one after "
+                             "another, or use an environment with a compiled twin (`rtg list --envs`)")
+        self.compile_seconds = 0.0
+        self._names: list[str] = []
+        self._advance: Any = None
+        self._check: Any = None
+
+    def _over_seeds(self, function: Callable) -> Callable:
+        return jax.vmap(function, in_axes=(None, 0)) if self.batched else function
+
+    def _compile(self, function: Callable, *arguments: Any, **options: Any) -> Any:
+        began = time.perf_counter()
+        compiled = jax.jit(function, **options).lower(*arguments).compile()
+        self.compile_seconds += time.perf_counter() - began
+        return compiled
+
+    def shapes(self) -> State:
+        """Structure, shapes and types of the state, without computing it."""
+        return jax.eval_shape(self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key)
+
+    def init(self) -> State:
+        """A fresh state: one compiled program, because op by op costs seconds."""
+        # The key of `init` lies outside the range of iterations, so that no iteration repeats it.
+        program = self._compile(self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key)
+        return self.guarded(lambda: program(self.algorithm, self.key))
+
+    def fresh_sums(self, state: State) -> Array:
+        """Sums of a row of metrics in which nothing has happened: `[M]`, or `[M, K]`."""
+        return jnp.zeros(self._table_shape(state))
+
+    def _table_shape(self, state: State) -> tuple[int, ...]:
+        if not self._names:
+            step = self._over_seeds_step()
+            metrics, _ = jax.eval_shape(lambda a, s, k: step(a, s, k)[1], self.algorithm, state, self.key)
+            self._names = [*sorted(metrics), *(f.name for f in dataclasses.fields(Episodes))]
+        return (len(self._names), *self.key.shape)
+
+    def _over_seeds_step(self) -> Callable:
+        step = lambda a, s, k: a.step(s, k)  # noqa: E731
+        return jax.vmap(step, in_axes=(None, 0, 0)) if self.batched else step
+
+    def advance(self, state: State, sums: Array, start: int, stop: int) -> tuple[State, Array, np.ndarray]:
+        """Iterations `start` to `stop` (at most `ROWS_PER_CHUNK` rows): new state, sums of the unfinished row, table of finished rows."""
+        leaves, structure = jax.tree.flatten(state)
+        large = [leaf.nbytes >= LARGE if hasattr(leaf, "nbytes") else False for leaf in leaves]
+        big = [x for x, heavy in zip(leaves, large, strict=True) if heavy]
+        small = [x for x, heavy in zip(leaves, large, strict=True) if not heavy]
+        if self._advance is None:
+            self._table_shape(state)
+            function = partial(self._chunk, structure, tuple(large))
+            self._advance = self._compile(function, self.algorithm, big, small, sums, self.key, 0, 0, 1, donate_argnums=1)
+        new, sums, table = self.guarded(lambda: self._advance(self.algorithm, big, small, sums, self.key, start, stop, self.row_every))
+        return jax.tree.unflatten(structure, new), sums, np.asarray(table)
+
+    def _chunk(self, structure: Any, large: tuple[bool, ...], algorithm: Algorithm, big: list, small: list, sums: Array, key: Array,
+               start: Array, stop: Array, every: Array) -> tuple[list, Array, Array]:
+        heavy, light = iter(big), iter(small)
+        state = jax.tree.unflatten(structure, [next(heavy) if is_large else next(light) for is_large in large])
+        step, fold = self._over_seeds_step(), jax.random.fold_in
+        fold = jax.vmap(fold, in_axes=(0, None)) if self.batched else fold
+
+        def iteration(i: Array, loop: tuple[State, Array]) -> tuple[State, Array]:
+            state, sums = loop
+            state, (metrics, episodes) = step(algorithm, state, fold(key, i))
+            values = [*(metrics[name] for name in sorted(metrics)), *(getattr(episodes, f.name) for f in dataclasses.fields(Episodes))]
+            return state, sums + jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
+
+        def row(r: Array, loop: tuple[State, Array, Array]) -> tuple[State, Array, Array]:
+            state, sums, table = loop
+            first = jnp.maximum(start, r * every)
+            sums = jnp.where(first == r * every, 0.0, sums)
+            state, sums = jax.lax.fori_loop(first, jnp.minimum(stop, (r + 1) * every), iteration, (state, sums))
+            return state, sums, jax.lax.dynamic_update_index_in_dim(table, sums, r - start // every, 0)
+
+        table = jnp.zeros((ROWS_PER_CHUNK, *sums.shape))
+        state, sums, table = jax.lax.fori_loop(start // every, -(-stop // every), row, (state, sums, table))
+        return jax.tree.leaves(state), sums, table
+
+    def rows(self, table: np.ndarray, start: int, stop: int) -> list[dict[str, Any]]:
+        """The rows that `advance` finished, as means: metrics by iteration, returns and lengths by episode (NaN where none ended)."""
+        found = []
+        for r in range(start // self.row_every, stop // self.row_every):
+            sums = dict(zip(self._names, table[r - start // self.row_every], strict=True))
+            count = sums["count"]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                row = {"iteration": (r + 1) * self.row_every, "env_steps": steps_after(self.algorithm, (r + 1) * self.row_every),
+                       "return_mean": sums["return_sum"] / count, "length_mean": sums["length_sum"] / count, "episodes": count}
+            metrics = self._names[: -len(dataclasses.fields(Episodes))]
+            found.append(row | {name: sums[name] / self.row_every for name in metrics})
+        return found
+
+    def check(self, state: State, rows: Sequence[dict[str, Any]]) -> None:
+        """Raise `NonFinite`, naming the first bad quantity, unless every metric and every learnt number is finite."""
+        for row in rows:
+            for name in self._names[: -len(dataclasses.fields(Episodes))]:
+                if not np.all(np.isfinite(row[name])):
+                    raise NonFinite(f"{name} is no longer a finite number at iteration {row['iteration']} ({row['env_steps']} steps): "
+                                    "lower the learning rate or look at the rewards; the last good checkpoint is kept")
+        learned = self.algorithm.learned(state)
+        if self._check is None:
+            self._check = self._compile(_all_finite, learned)
+        finite = self._check(learned)
+        for path, good in jax.tree_util.tree_leaves_with_path(finite):
+            if not good:
+                raise NonFinite(f"the parameter {jax.tree_util.keystr(path)} is no longer finite: "
+                                "lower the learning rate or look at the rewards; the last good checkpoint is kept")
+
+    def guarded(self, call: Callable[[], Any]) -> Any:
+        """Run a compiled call to its end; an error inside a foreign environment comes out as its own sentence."""
+        try:
+            return jax.block_until_ready(call())
+        except Exception as error:
+            failure = failure_of(self.algorithm)
+            if failure is not None:
+                raise failure from error
+            raise
+
+
+def _all_finite(tree: State) -> State:
+    inexact = lambda x: jnp.issubdtype(x.dtype, jnp.inexact)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.isfinite(x).all() if inexact(x) else jnp.ones((), bool), tree)
+
+
+def run(
+    algorithm: Algorithm,
+    key: Key[Array, "..."],
+    iterations: int,
+    *,
+    callbacks: Iterable[Callback | Every] = (),
+    row_every: int | None = None,
+    chunk_seconds: float = 1.0,
+    resume_from: tuple[State, Array, int] | None = None,
+    program: Program | None = None,
+) -> tuple[State, dict[str, np.ndarray]]:
+    """Train for `iterations` iterations; returns the state and the metrics, one array over rows each.
+
+    - `key`: one key, or an array of K keys to train K seeds in one program.
+    - `callbacks`: called between chunks with a `Moment`; one that returns True stops the run.
+    - `row_every`: iterations in a row of metrics; by default so that there are about 200 rows.
+    - `resume_from`: state, sums of the unfinished row and finished iterations of an earlier run.
+
+    Raises `NonFinite` where a loss or parameter is no longer a number, `EnvironmentFailure` where a foreign environment fails.
+    """
+    if iterations < 1:
+        raise ValueError(f"a run needs at least one iteration, not {iterations}")
+    algorithm = algorithm.with_horizon(iterations)
+    row_every = row_every or max(1, iterations // 200)
+    program = program or Program(algorithm, key, row_every)
+    if resume_from is None:
+        state = program.init()
+        sums, done = program.fresh_sums(state), 0
+    else:
+        state, sums, done = resume_from
+    marks = [c.iterations for c in callbacks if isinstance(c, Every)]
+    callbacks = list(callbacks)
+    history: list[dict[str, Any]] = []
+    pace, seconds, stop = None, 0.0, False
+    while done < iterations and not stop:
+        until = min([iterations, *((done // mark + 1) * mark for mark in marks), (done // row_every + ROWS_PER_CHUNK) * row_every])
+        length = 1 if pace is None else max(1, min(until - done, int(chunk_seconds / pace)))
+        compiling, started = program.compile_seconds, time.perf_counter()
+        state, sums, table = program.advance(state, sums, done, done + length)
+        spent = time.perf_counter() - started - (program.compile_seconds - compiling)
+        # Chunks at most double, so that one lucky measurement does not make the next chunk deaf to Ctrl-C.
+        pace = spent / length if pace is None else max(spent / length, pace / 2)
+        rows = program.rows(table, done, done + length)
+        program.check(state, rows)
+        done, history = done + length, history + rows
+        seconds += spent
+        moment = Moment(algorithm, state, sums, done, iterations, rows, seconds, program.compile_seconds)
+        for callback in callbacks:
+            if isinstance(callback, Every):
+                stop |= bool(callback.callback(moment)) if done % callback.iterations == 0 else False
+            else:
+                stop |= bool(callback(moment))
+        del moment
+    names = history[0] if history else {}
+    return state, {name: np.asarray([row[name] for row in history]) for name in names}
+
+
+__all__ = ["Callback", "EnvironmentFailure", "Every", "Moment", "NonFinite", "Program", "iterations_for", "run", "steps_after"]

@@ -1,0 +1,120 @@
+"""How good a policy is: whole episodes, as many from each environment, with a confidence interval.
+
+Each of L environments plays the same number of episodes to their ends and what it does beyond that is ignored. Stopping at the first
+N episodes that happen to end would favour short ones.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..core import Actor, Policy, VectorEnv, env_spec
+from ..envs.gymnasium import failure_of
+from ..loops.collect import begin, fresh_carry, reset_where
+
+MAX_STEPS = 50_000
+"""Steps an environment may take for one episode before evaluation gives up on it."""
+BOOTSTRAP = 10_000
+
+
+class Returns(eqx.Module):
+    """Undiscounted returns and lengths of episodes, `[Q, L]`: Q episodes in each of L environments."""
+
+    returns: Float[Array, "Q L"]
+    lengths: Float[Array, "Q L"]
+    finished: Float[Array, "L"]
+
+
+@partial(jax.jit, static_argnames=("quota",))
+def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
+    """Play `quota` episodes in each environment."""
+    action_spec, lanes = env_spec(env).action, env.num_envs
+    begin_key, carry_key, loop_key = jax.random.split(key, 3)
+    fresh = fresh_carry(policy, carry_key, lanes)
+    table = jnp.zeros((quota, lanes))
+
+    def going(loop: tuple) -> Array:
+        _, returns, step = loop
+        return (returns.finished < quota).any() & (step < MAX_STEPS * quota)
+
+    def body(loop: tuple[Actor, Returns, Array]) -> tuple[Actor, Returns, Array]:
+        actor, found, step = loop
+        act_key, env_key = jax.random.split(jax.random.fold_in(loop_key, step))
+        choose = jax.vmap(lambda c, o, k: policy(c, o, k))
+        carry, action, _ = choose(actor.carry, actor.observation, jax.random.split(act_key, lanes))
+        env_state, timestep = env.step(actor.env_state, action_spec.clip(action), jax.random.split(env_key, lanes))
+        done = timestep.done
+        total, length = actor.stats.return_so_far + timestep.reward, actor.stats.length_so_far + 1.0
+        here = (jnp.arange(quota, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
+        found = Returns(jnp.where(here, total[None, :], found.returns), jnp.where(here, length[None, :], found.lengths), found.finished + done)
+        stats = type(actor.stats)(jnp.where(done, 0.0, total), jnp.where(done, 0.0, length))
+        return Actor(env_state, timestep.observation, reset_where(done, fresh, carry), stats), found, step + 1
+
+    start = (begin(env, policy, begin_key), Returns(table, table, jnp.zeros(lanes)), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(going, body, start)[1]
+
+
+class Evaluator:
+    """Plays policies in `env`, `episodes` at a time. Policies of one kind share one compiled program.
+
+    With `seeds`, policies have a leading axis of seeds and so have the results.
+    """
+
+    def __init__(self, env: VectorEnv, episodes: int, seeds: bool = False):
+        if episodes < 1:
+            raise ValueError(f"an evaluation needs at least one episode, not {episodes}")
+        self.env, self.seeds = env, seeds
+        self.quota = -(-episodes // env.num_envs)
+
+    def __call__(self, policy: Policy, key: Array) -> tuple[np.ndarray, np.ndarray]:
+        """Returns and lengths `[N]` (`[K, N]` with seeds), N the episodes asked for, rounded up to whole rounds.
+
+        Raises `ValueError` where an episode does not end, `EnvironmentFailure` where a foreign environment fails.
+        """
+        play: Callable[..., Any] = partial(_play, quota=self.quota)
+        if self.seeds:
+            play = jax.vmap(play, in_axes=(None, 0, None))
+        try:
+            found = jax.device_get(play(self.env, policy, key))
+        except Exception as error:
+            failure = failure_of(self.env)
+            raise (failure or error) from (error if failure else None)
+        if np.any(found.finished < self.quota):
+            raise ValueError(f"an episode of this environment did not end within {MAX_STEPS * self.quota} steps, so it has no return: "
+                             "give the environment a time limit (gymnasium.make(..., max_episode_steps=N), or rtg.envs.TimeLimit)")
+        flat = (*found.returns.shape[:-2], -1)
+        return found.returns.reshape(flat), found.lengths.reshape(flat)
+
+
+def lanes_for(episodes: int, compiled: bool) -> int:
+    """How many environments to evaluate in: the divisor of `episodes` nearest below 20 (compiled) or 8 (on the host)."""
+    most = 20 if compiled else 8
+    return max(n for n in range(1, min(most, episodes) + 1) if episodes % n == 0)
+
+
+def confidence(values: np.ndarray, statistic: Callable[..., np.ndarray] = np.mean, level: float = 0.95) -> tuple[float, float]:
+    """Percentile bootstrap interval of a statistic of independent values (Efron 1979), the same for the same values."""
+    values = np.asarray(values, np.float64)
+    if len(values) < 2:
+        return float(values[0]), float(values[0])
+    draws = np.random.default_rng(0).integers(0, len(values), (BOOTSTRAP, len(values)))
+    spread = statistic(values[draws], axis=1)
+    low, high = np.quantile(spread, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def summary(returns: np.ndarray, lengths: np.ndarray) -> dict[str, Any]:
+    """What `rtg eval --json` prints."""
+    return {
+        "episodes": len(returns),
+        "return_mean": float(np.mean(returns)),
+        "return_std": float(np.std(returns, ddof=1)) if len(returns) > 1 else 0.0,
+        "return_ci95": list(confidence(returns)),
+        "length_mean": float(np.mean(lengths)),
+    }

@@ -1,0 +1,226 @@
+"""What a run is: algorithm, environment, budget, put together from names, objects or a run folder's `config.json`."""
+
+import dataclasses
+import math
+import platform
+from typing import Any
+
+import gymnasium
+import jax
+
+from .. import presets
+from ..catalogue import ALGORITHMS, LOOPS, algorithm_row
+from ..core import Algorithm, Environment, Learner, VectorEnv
+from ..data.episodes import load_dataset
+from ..envs.gymnasium import hosted
+from ..envs.registry import COMPILED, make
+from ..envs.vectorize import Vectorized, vectorize
+from .config import build, describe, merge, resolve
+from .engine import iterations_for, steps_after
+from .evaluate import lanes_for
+from .policy import restore_learner
+
+DEFAULT_STEPS = 100_000
+ROWS, EVALUATIONS = 200, 10
+"""How many rows of metrics and how many evaluations a run has, about."""
+
+
+@dataclasses.dataclass
+class Plan:
+    """One run, ready to be executed. `config` is what `config.json` says of it; `env` is None offline without an environment."""
+
+    algorithm: Algorithm
+    learner: Learner
+    env: VectorEnv | None
+    eval_env: VectorEnv | None
+    config: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """What the algorithm is called."""
+        return self.config["algorithm"]
+
+    @property
+    def iterations(self) -> int:
+        """The budget in iterations."""
+        return self.config["iterations"]
+
+
+def plan(
+    algorithm: str | Learner | Algorithm,
+    env: Any,
+    *,
+    steps: int | None = None,
+    seed: int = 0,
+    num_envs: int | None = None,
+    backend: str = "auto",
+    learner: dict[str, Any] | None = None,
+    loop: dict[str, Any] | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    preset: str = "auto",
+    data: Any = None,
+    eval_episodes: int = 20,
+    evaluations: int = EVALUATIONS,
+) -> Plan:
+    """Put a run together. Raises `ValueError` with one sentence for whatever cannot be, before anything is compiled or written."""
+    name = algorithm if isinstance(algorithm, str) else _name_of(algorithm)
+    env_name = env if isinstance(env, str) else _title(env)
+    ready = _preset(preset, name, env_name)
+    check_budget(steps, seed)
+    if isinstance(algorithm, Algorithm):
+        if learner or loop:
+            raise ValueError("an algorithm that is put together already takes no options for its learner or loop: set them where it was made")
+        whole, inner = algorithm, _learner_of(algorithm)
+        vector_env: VectorEnv | None = _env_of(algorithm)
+    else:
+        inner = _learner(algorithm, merge(ready.get("learner", {}), learner or {}))
+        options = merge(ready.get("loop", {}), loop or {})
+        kind = algorithm_row(name).loop if name in ALGORITHMS else ("on_policy" if inner.batch == "rollout" else "off_policy")
+        if data is not None:
+            kind = "offline"
+        cls = resolve(LOOPS[kind])
+        if kind == "offline":
+            if data is None:
+                raise ValueError(f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data")
+            dataset = load_dataset(data) if isinstance(data, str) else data
+            vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            whole = build(cls, options, dataset=dataset, learner=inner)
+        else:
+            number = num_envs if num_envs is not None or not isinstance(env, (str, Environment)) else ready.get("num_envs", cls.default_num_envs())
+            vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            whole = build(cls, options, env=vector_env, learner=inner)
+    steps = int(steps or ready.get("steps", DEFAULT_STEPS))
+    iterations = iterations_for(whole, steps)
+    row_every = max(1, iterations // ROWS)
+    eval_every = max(1, round(iterations / max(1, evaluations) / row_every)) * row_every
+    whole = whole.with_horizon(iterations)
+    inner = _learner_of(whole) if inner is not None else None
+    config = {
+        "algorithm": name,
+        "env": {"id": env_name, "backend": _backend(vector_env), "num_envs": vector_env.num_envs if vector_env is not None else 0,
+                "kwargs": env_kwargs or {}, "by_name": isinstance(env, str)},
+        "learner": describe(inner) if inner is not None else {},
+        "loop": describe(whole),
+        "data": data if isinstance(data, str) else None,
+        "seed": seed, "steps": steps_after(whole, iterations), "iterations": iterations, "row_every": row_every,
+        "eval_every": eval_every, "eval_episodes": eval_episodes, "versions": versions(),
+    }
+    return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs or {}, eval_episodes), config)
+
+
+def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, learner: Learner | None = None) -> Plan:
+    """The run that a folder's configuration describes, with a longer budget if `steps` is given."""
+    described = config["env"]
+    if env is None and not described["by_name"] and described["num_envs"]:
+        raise ValueError(f"the run was made with an environment object ({described['id']}), which a file cannot hold: "
+                         "resume it from Python with rtg.resume(path, env=...)")
+    source = described["id"] if env is None else env
+    inner = restore_learner({"algorithm": config["algorithm"], "learner": config["learner"]}, learner)
+    kind = config["loop"]["class"]
+    if kind not in LOOPS.values() and kind not in {path.replace(":", ":") for path in LOOPS.values()}:
+        raise ValueError(f"the run was made with {kind}, which is not one of the library's loops: resume it from Python with rtg.run")
+    cls = resolve(kind)
+    backend = described["backend"]
+    eval_env: VectorEnv | None
+    if kind == LOOPS["offline"]:
+        if config["data"] is None:
+            raise ValueError("the run was made with a dataset object, which a file cannot hold: it cannot be resumed by name")
+        vector_env = make(source, 1, backend=backend, **described["kwargs"]) if described["num_envs"] else None
+        whole: Algorithm = build(cls, config["loop"], dataset=load_dataset(config["data"]), learner=inner)
+    else:
+        vector_env = make(source, described["num_envs"], backend=backend, **described["kwargs"])
+        whole = build(cls, config["loop"], env=vector_env, learner=inner)
+    config = dict(config)
+    if steps is not None:
+        check_budget(steps, config["seed"])
+        iterations = iterations_for(whole, steps)
+        if iterations < config["iterations"]:
+            raise ValueError(f"the run's budget is {config['steps']} steps already: --steps can extend it, and {steps} is less")
+        config |= {"iterations": iterations, "steps": steps_after(whole, iterations)}
+    eval_env = _evaluation_env(source, vector_env, backend, described["kwargs"], config["eval_episodes"])
+    return Plan(whole, inner, vector_env, eval_env, config)
+
+
+def check_budget(steps: Any, seed: Any) -> None:
+    """Raise `ValueError` unless steps and seed are whole numbers that make sense."""
+    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, float)) or not math.isfinite(steps) or steps < 1):
+        raise ValueError(f"the number of steps must be at least 1, not {steps}")
+    if steps is not None and steps > 1e15:
+        raise ValueError(f"{steps:g} steps would take centuries: give at most 1e15")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ValueError(f"a seed is a whole number from 0 to 2^32 - 1, not {seed}")
+
+
+def versions() -> dict[str, str]:
+    """What made a run."""
+    from .. import __version__
+
+    return {"rewardtogo": __version__, "jax": jax.__version__, "gymnasium": gymnasium.__version__,
+            "python": platform.python_version(), "device": jax.devices()[0].platform, "system": platform.system()}
+
+
+def _preset(choice: str, algorithm: str, env: str) -> dict[str, Any]:
+    if choice == "none":
+        return {}
+    if choice == "auto":
+        return presets.preset(algorithm, env)
+    name, _, other = choice.partition("/")
+    found = presets.preset(name, other) if other else presets.preset(algorithm, name)
+    if not found:
+        known = ", ".join(f"{a}/{e}" for a, e in sorted(presets.PRESETS))
+        raise ValueError(f"there is no preset {choice!r}: known are auto, none, {known}")
+    return found
+
+
+def _name_of(algorithm: Learner | Algorithm) -> str:
+    inner = _learner_of(algorithm) if isinstance(algorithm, Algorithm) else algorithm
+    cls = type(algorithm if inner is None else inner)
+    path = f"{cls.__module__}:{cls.__name__}"
+    return next((row.name for row in ALGORITHMS.values() if row.path == path), path)
+
+
+def _learner(algorithm: str | Learner, data: dict[str, Any]) -> Learner:
+    if isinstance(algorithm, Learner):
+        if data:
+            return build(type(algorithm), {**describe(algorithm), **data})
+        return algorithm
+    cls = resolve(algorithm if ":" in algorithm else algorithm_row(algorithm).path)
+    if not (isinstance(cls, type) and issubclass(cls, Learner)):
+        raise ValueError(f"{algorithm} is not a rewardtogo.Learner")
+    return build(cls, data)
+
+
+def _learner_of(algorithm: Algorithm) -> Any:
+    fields = {f.name for f in dataclasses.fields(algorithm)}
+    return algorithm.learner if "learner" in fields else None  # type: ignore[attr-defined]
+
+
+def _env_of(algorithm: Algorithm) -> VectorEnv | None:
+    fields = {f.name for f in dataclasses.fields(algorithm)}
+    return algorithm.env if "env" in fields else None  # type: ignore[attr-defined]
+
+
+def _title(env: Any) -> str:
+    if env is None:
+        return "none"
+    if isinstance(env, Vectorized):
+        return type(env.env).__name__
+    named = hosted(env)[0].name if isinstance(env, VectorEnv) and hosted(env) else None
+    name = vars(env).get("__name__") or getattr(env, "__name__", type(env).__name__)
+    return named or ("custom" if name == "<lambda>" else name)
+
+
+def _backend(env: VectorEnv | None) -> str:
+    return "gymnasium" if hosted(env) else "jax"
+
+
+def _evaluation_env(source: Any, env: VectorEnv | None, backend: str, kwargs: dict[str, Any], episodes: int) -> VectorEnv | None:
+    """Environments of its own for evaluation; None where the only one there is is being trained in."""
+    if source is None or env is None:
+        return None
+    if isinstance(env, Vectorized):
+        return vectorize(env.env, lanes_for(episodes, compiled=True))
+    if isinstance(source, VectorEnv) or isinstance(source, (gymnasium.Env, gymnasium.vector.VectorEnv)):
+        return None if hosted(env) else env
+    compiled = not hosted(env)
+    return make(source, lanes_for(episodes, compiled), backend="gymnasium" if source in COMPILED and not compiled else backend, **kwargs)
