@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
-            "number part setting",
+    "number part setting",
     "data.replay": "UniformReplay",
     "envs.gymnasium": "EnvironmentFailure GymnasiumEnv",
     "envs.registry": "make",
@@ -78,7 +78,20 @@ _HOMES = {
     "value.dqn": "DQN",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
-_ROOMS = ("core", "data", "envs", "exact", "figures", "imitation", "loops", "nn", "ops", "policy_gradient", "runner", "value")
+_ROOMS = (
+    "core",
+    "data",
+    "envs",
+    "exact",
+    "figures",
+    "imitation",
+    "loops",
+    "nn",
+    "ops",
+    "policy_gradient",
+    "runner",
+    "value",
+)
 
 __all__ = ["__version__", *sorted(_HOME)]
 

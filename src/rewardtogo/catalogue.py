@@ -23,11 +23,42 @@ ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 ALGORITHMS: dict[str, Row] = {
     row.name: row
     for row in (
-        Row("bc", "rewardtogo.imitation.bc:BC", "offline", "2", "2", ANY, "behavioural cloning: maximum likelihood of an expert's actions"),
-        Row("reinforce", "rewardtogo.policy_gradient.reinforce:REINFORCE", "on_policy", "3", "Alg 2", ANY,
-            "Monte-Carlo policy gradient with reward-to-go and a learned baseline"),
-        Row("ppo", "rewardtogo.policy_gradient.ppo:PPO", "on_policy", "7", "7.27", ANY, "proximal policy optimisation, clipped surrogate and GAE"),
-        Row("dqn", "rewardtogo.value.dqn:DQN", "off_policy", "6", "Alg 13", ("discrete",), "deep Q-learning with replay and target network, double or plain"),
+        Row(
+            "bc",
+            "rewardtogo.imitation.bc:BC",
+            "offline",
+            "2",
+            "2",
+            ANY,
+            "behavioural cloning: maximum likelihood of an expert's actions",
+        ),
+        Row(
+            "reinforce",
+            "rewardtogo.policy_gradient.reinforce:REINFORCE",
+            "on_policy",
+            "3",
+            "Alg 2",
+            ANY,
+            "Monte-Carlo policy gradient with reward-to-go and a learned baseline",
+        ),
+        Row(
+            "ppo",
+            "rewardtogo.policy_gradient.ppo:PPO",
+            "on_policy",
+            "7",
+            "7.27",
+            ANY,
+            "proximal policy optimisation, clipped surrogate and GAE",
+        ),
+        Row(
+            "dqn",
+            "rewardtogo.value.dqn:DQN",
+            "off_policy",
+            "6",
+            "Alg 13",
+            ("discrete",),
+            "deep Q-learning with replay and target network, double or plain",
+        ),
     )
 }
 
@@ -65,5 +96,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def algorithm_row(name: str) -> Row:
     """The row of an algorithm. Raises `ValueError` with the nearest names where there is none."""
     if name not in ALGORITHMS:
-        raise ValueError(f"there is no algorithm {name!r}: {nearest(name, ALGORITHMS)} Your own is written module:Class.")
+        raise ValueError(
+            f"there is no algorithm {name!r}: {nearest(name, ALGORITHMS)} Your own is written module:Class."
+        )
     return ALGORITHMS[name]

@@ -37,6 +37,15 @@ class Counting(gym.Env):
         return self.look(), reward, over and even, over and not even, {**self.info(), **success}
 
 
+class Narrow(Counting):
+    """The same in 32 bits, which no copy is made of on the way in."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (3,))
+
+    def look(self):
+        return super().look().astype(np.float32)
+
+
 class Plain(Counting):
     """The same with an empty info, which Gymnasium's own vector environments can put together."""
 

@@ -30,16 +30,22 @@ name = lambda probe: repr(probe).replace(" ", "")  # noqa: E731
 
 def roll(probe, length=40, size=4):
     """Observations before each of `length` random actions in `size` copies, those actions, and the timesteps; flat."""
-    env, keys = vectorize(probe, size), jax.random.split(jax.random.key(0), 3)
-    state, first = env.reset(jax.random.split(keys[0], size))
-    actions = jax.vmap(env_spec(env).action.sample)(jax.random.split(keys[1], length * size))
-    actions = actions.reshape(length, size, *actions.shape[1:])
-    xs = (actions, jax.random.split(keys[2], (length, size)))
-    _, steps = jax.jit(lambda state, xs: jax.lax.scan(lambda s, x: env.step(s, *x), state, xs))(state, xs)
-    before = jnp.concatenate([first[None], steps.observation[:-1]])
-    names = ("observation", "reward", "terminated", "truncated", "done", "final_observation")
+    env = vectorize(probe, size)
+
+    @jax.jit
+    def run(key):
+        reset_key, action_key, step_key = jax.random.split(key, 3)
+        state, first = env.reset(jax.random.split(reset_key, size))
+        actions = jax.vmap(jax.vmap(env_spec(env).action.sample))(jax.random.split(action_key, (length, size)))
+        xs = (actions, jax.random.split(step_key, (length, size)))
+        _, steps = jax.lax.scan(lambda s, x: env.step(s, *x), state, xs)
+        return jnp.concatenate([first[None], steps.observation[:-1]]), actions, steps, steps.done
+
     flat = lambda x: np.asarray(x).reshape(-1, *x.shape[2:])  # noqa: E731
-    return flat(before), flat(actions), SimpleNamespace(**{name: flat(getattr(steps, name)) for name in names})
+    before, actions, steps, done = run(jax.random.key(0))
+    names = ("observation", "reward", "terminated", "truncated", "final_observation")
+    columns = {name: flat(getattr(steps, name)) for name in names}
+    return flat(before), flat(actions), SimpleNamespace(**columns, done=flat(done))
 
 
 def index(probe, observations):
@@ -74,7 +80,7 @@ def test_values_of_actions(probe):
 @pytest.mark.parametrize("probe", EVERY, ids=name)
 def test_value_of_an_episode(probe):
     keys = jax.random.split(jax.random.key(1), 2000)
-    first = np.asarray(jax.vmap(lambda key: probe.reset(key)[1])(keys))
+    first = np.asarray(jax.jit(jax.vmap(lambda key: probe.reset(key)[1]))(keys))
     here, known = index(probe, first)
     assert known.all()
     assert abs(probe.values(0.9)[here].mean() - probe.value(0.9)) <= 4 / np.sqrt(2000)
@@ -145,9 +151,9 @@ def test_recall(delay, cues):
     assert np.all(np.asarray(seen)[:, 0, :-1].sum(axis=-1) == 1) and not np.asarray(seen)[:, 1:, :-1].any()
     np.testing.assert_array_equal(np.asarray(seen)[:, :, -1], np.tile(np.eye(delay + 2)[delay], (size, 1)))
     # When asked, all episodes look the same: a memoryless policy is a fixed answer, and each is right once in `cues`.
-    for fixed in range(cues):
-        answer = lambda seen, t, fixed=fixed: jnp.asarray(fixed, jnp.int32)  # noqa: E731
-        mean = float(jax.jit(jax.vmap(lambda key, answer=answer: episode(key, answer)[0]))(keys).mean())
+    fixed = jax.jit(jax.vmap(lambda key, answer: episode(key, lambda seen, t: answer)[0], in_axes=(0, None)))
+    for answer in range(cues):
+        mean = float(np.mean(fixed(keys, jnp.asarray(answer, jnp.int32))))
         assert abs(mean - probe.memoryless_value(0.9)) <= 4 * 0.9**delay * 0.5 / np.sqrt(size)
     assert probe.memoryless_value(0.9) == pytest.approx(probe.value(0.9) / cues)
 

@@ -63,7 +63,12 @@ def test_mdp_keeps_what_it_was_given(item):
         check(np.abs(mdp.transitions.sum(-1) - 1).max(), "<=", 1e-12, "row sums")
         check(MDP(P.astype(np.float32), R, 0, 0.9).transitions.dtype == np.float32, "==", True, "precision kept")
         ended = MDP(P, R, 0, 1.0, terminal=[False, True])
-        check(np.abs(ended.transitions[1] - [0, 1]).max() + np.abs(ended.rewards[1]).max(), "==", 0, "absorbing")
+        check(
+            np.abs(np.asarray(ended.transitions)[1] - [0, 1]).max() + np.abs(ended.rewards[1]).max(),
+            "==",
+            0,
+            "absorbing",
+        )
         check(MDP(P, R, 0, 1.0, horizon=3).horizon, "==", 3, "discount 1 with a horizon")
 
 
@@ -109,7 +114,7 @@ def test_the_environment_has_the_transitions_of_its_mdp(item):
         check(live.sum(), "==", 12, "pairs visited")
         check((terminated != ends).sum() + truncated.sum(), "==", 0, "E1.5: terminated where terminal, never truncated")
         check((seen != after).sum(), "==", 0, "final observation is where the step led")
-        check(np.abs(reward - np.float32(mdp.rewards)[s, a]).max(), "==", 0, "rewards")
+        check(np.abs(reward - np.asarray(mdp.rewards, np.float32)[s, a]).max(), "==", 0, "rewards")
 
 
 def test_a_horizon_terminates_and_an_endless_loop_does_not(item):
@@ -259,7 +264,9 @@ def test_pacman_value_is_that_of_brute_force(item):
                 abs(mdp.initial @ iterated - brute_force(PACMAN_BOARD, discount)), "<=", 1e-12, "value iteration, 5x5"
             )
             check(np.abs(iterated - optimal_q_values(mdp).max(-1)).max(), "<=", 1e-12, "against policy iteration")
-        check(set(np.unique(pacman().outcome_rewards)) == {-100.0, 0.0, 1.0}, "==", True, "+1 dot, -100 ghost")
+        check(
+            set(np.unique(np.asarray(pacman().outcome_rewards))) == {-100.0, 0.0, 1.0}, "==", True, "+1 dot, -100 ghost"
+        )
         safe, slippery = (q_values(m, np.full((m.num_states, 4), 0.25)) for m in (pacman(), pacman(slip=1.0)))
         check(np.abs(slippery.mean(1) - safe.mean(1)).max(), "<=", 1e-9, "slip 1 is the uniform policy")
 

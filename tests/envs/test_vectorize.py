@@ -38,15 +38,18 @@ class Dictionary(Environment):
         return {"draw": jax.random.uniform(state[0], (2,)), "taken": state[1]}
 
 
-def roll(env: VectorEnv, length: int, key: jax.Array, actions: jax.Array | None = None):
+def roll(env: VectorEnv, length: int, key: jax.Array):
     """First observation and `length` steps of random actions, as one compiled scan."""
-    reset_key, action_key, step_key = jax.random.split(key, 3)
-    if actions is None:
+
+    @jax.jit
+    def run(key):
+        reset_key, action_key, step_key = jax.random.split(key, 3)
         actions = jax.random.randint(action_key, (length, env.num_envs), 0, 2)
-    state, first = env.reset(jax.random.split(reset_key, env.num_envs))
-    keys = jax.random.split(step_key, (length, env.num_envs))
-    steps = jax.jit(lambda state, xs: jax.lax.scan(lambda s, x: env.step(s, *x), state, xs)[1])(state, (actions, keys))
-    return first, steps
+        state, first = env.reset(jax.random.split(reset_key, env.num_envs))
+        keys = jax.random.split(step_key, (length, env.num_envs))
+        return first, jax.lax.scan(lambda s, x: env.step(s, *x), state, (actions, keys))[1]
+
+    return run(key)
 
 
 @pytest.mark.parametrize("size", [1, 3])

@@ -89,24 +89,28 @@ class SecondOrder(Environment):
 
 def roll(env: VectorEnv, length: int, actions=None, policy=lambda observation, action: action):
     """First observation, actions and `length` timesteps, as NumPy arrays `[length, size, ...]`. Random actions."""
-    keys = jax.random.split(jax.random.key(0), 3)
-    state, first = env.reset(jax.random.split(keys[0], env.num_envs))
-    if actions is None:
-        actions = jax.vmap(env_spec(env).action.sample)(jax.random.split(keys[1], length * env.num_envs))
-        actions = actions.reshape(length, env.num_envs, *actions.shape[1:])
 
-    def step(env, loop, given):
-        state, timestep = env.step(loop[0], policy(loop[1], given[0]), given[1])
-        return (state, timestep.observation), timestep
+    @jax.jit
+    def run(env, key, actions):
+        reset_key, action_key, step_key = jax.random.split(key, 3)
+        state, first = env.reset(jax.random.split(reset_key, env.num_envs))
+        if actions is None:
+            action_keys = jax.random.split(action_key, (length, env.num_envs))
+            actions = jax.vmap(jax.vmap(env_spec(env).action.sample))(action_keys)
 
-    xs = (actions, jax.random.split(keys[2], (length, env.num_envs)))
+        def step(loop, given):
+            state, timestep = env.step(loop[0], policy(loop[1], given[0]), given[1])
+            return (state, timestep.observation), timestep
+
+        final, steps = jax.lax.scan(step, (state, first), (actions, jax.random.split(step_key, (length, env.num_envs))))
+        return first, actions, final, steps, steps.done
+
     # The environment is an argument of the compiled program: each has only leaves that may be one.
-    run = jax.jit(lambda env, loop, xs: jax.lax.scan(lambda loop, x: step(env, loop, x), loop, xs))
-    final, steps = run(env, (state, first), xs)
+    first, actions, final, steps, done = run(env, jax.random.key(0), actions)
     assert all(eqx.is_array(leaf) for leaf in jax.tree.leaves(final))
-    names = ("observation", "reward", "terminated", "truncated", "done", "final_observation", "extras")
+    names = ("observation", "reward", "terminated", "truncated", "final_observation", "extras")
     columns = {name: jax.tree.map(np.asarray, getattr(steps, name)) for name in names}
-    return np.asarray(first), np.asarray(actions), SimpleNamespace(**columns)
+    return np.asarray(first), np.asarray(actions), SimpleNamespace(**columns, done=np.asarray(done))
 
 
 def ending(how: str, wrap):
@@ -203,18 +207,20 @@ def test_mask_hides_velocities():
 def test_noise(scale):
     env = NoisyObservation(Pendulum(), scale)
     assert env.observation_space == spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    truth = lambda state: np.stack([np.cos(state[:, 0]), np.sin(state[:, 0]), state[:, 1]], axis=1)  # noqa: E731
     reset_keys, keys = jax.random.split(jax.random.key(3), (2, 4000))
     state, seen = jax.jit(jax.vmap(lambda key: env.reset(key)))(reset_keys)
-    looks = [seen - jax.vmap(lambda s: jnp.stack([jnp.cos(s[0]), jnp.sin(s[0]), s[1]]))(state)]
+    looks = [seen - truth(state)]
     state, step = jax.jit(jax.vmap(lambda s, key: env.step(s, jnp.zeros(1), key)))(state, keys)
-    looks.append(step.observation - jnp.stack([jnp.cos(state[:, 0]), jnp.sin(state[:, 0]), state[:, 1]], axis=1))
+    looks.append(step.observation - truth(state))
     for noise in np.asarray(looks):
         assert np.all(np.abs(noise.mean(axis=0)) <= 4 * scale / np.sqrt(4000) + 1e-6)
         np.testing.assert_allclose(noise.std(axis=0), np.broadcast_to(scale, 3), rtol=4 / np.sqrt(8000), atol=1e-6)
     np.testing.assert_array_equal(step.observation, step.final_observation)
     # Fresh noise at each look, none in the state or in the reward.
     assert np.abs(np.corrcoef(looks[0][:, 0], looks[1][:, 0])[0, 1]) < 0.07
-    (plain, one), (noisy, other) = (e.step(jnp.ones(2), jnp.zeros(1), keys[0]) for e in (Pendulum(), env))
+    once = jax.jit(lambda env: env.step(jnp.ones(2), jnp.zeros(1), keys[0]))
+    (plain, one), (noisy, other) = once(Pendulum()), once(env)
     np.testing.assert_array_equal(plain, noisy)
     assert one.reward == other.reward
 
@@ -310,7 +316,7 @@ def test_the_true_reward_reproduces_returns(item):
 def test_gradients_reach_a_learned_reward():
     env, key = RewardFunction(MountainCarContinuous(), LearnedReward(jnp.ones(()), jnp.ones(()))), jax.random.key(0)
     pay = lambda env: env.step(env.reset(key)[0], jnp.asarray([0.5]), key)[1].reward  # noqa: E731
-    slope = jax.grad(pay)(env)
+    slope = jax.jit(jax.grad(pay))(env)
     assert float(slope.function.price) == -0.25 and float(slope.function.prize) == 0.0
 
 
@@ -357,9 +363,10 @@ def test_normalised_rewards_after_a_termination():
 def test_running_statistics_merge_exactly():
     draws = np.random.default_rng(0).normal(3.0, 2.0, (50, 4))
     with jax.enable_x64(True):
-        mean, variance, count = (jnp.asarray(x) for x in (0.0, 0.0, 0.0))
+        mean, variance, count = (jnp.zeros(()) for _ in range(3))
+        merging = jax.jit(lambda *args: merge(*args))
         for row in draws:
-            mean, variance, count = merge(mean, variance, count, jnp.asarray(row))
+            mean, variance, count = merging(mean, variance, count, jnp.asarray(row))
     np.testing.assert_allclose([mean, variance, count], [draws.mean(), draws.var(), draws.size], rtol=1e-12)
 
 

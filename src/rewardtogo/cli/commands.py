@@ -28,7 +28,7 @@ def cache_folder() -> Path:
 
 def use_cache() -> None:
     """Keep compiled programs: a second run of the same shapes starts in a fraction of the time."""
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -48,19 +48,36 @@ def perform(name: str, given: argparse.Namespace, groups: dict[str, dict[str, An
             raise
         return _say(str(error), WRONG)
     except OSError as error:
-        return _say(f"{error.strerror or error}{f' ({error.filename})' if error.filename else ''}: "
-                    "what was written before is whole; free some space or choose another folder", 1)
+        return _say(
+            f"{error.strerror or error}{f' ({error.filename})' if error.filename else ''}: "
+            "what was written before is whole; free some space or choose another folder",
+            1,
+        )
     return 0
 
 
 def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     file = _config_file(given.config) if given.config else {}
-    extra = {"learner": merge(file.get("learner", {}), groups["learner"]), "loop": merge(file.get("loop", {}), groups["loop"]),
-             "env_kwargs": {**file.get("env", {}), **{k: _value(v) for k, v in groups["env"].items()}}}
+    extra = {
+        "learner": merge(file.get("learner", {}), groups["learner"]),
+        "loop": merge(file.get("loop", {}), groups["loop"]),
+        "env_kwargs": {**file.get("env", {}), **{k: _value(v) for k, v in groups["env"].items()}},
+    }
     found = train(
-        given.algorithm, given.env, steps=_whole(given.steps, file.get("steps")), seed=given.seed, num_seeds=given.num_seeds,
-        num_envs=given.num_envs if given.num_envs is not None else file.get("num_envs"), out=given.out, backend=given.backend,
-        preset=given.preset, data=given.data, command=["rtg", *given.arguments], **extra, **_limits(given))
+        given.algorithm,
+        given.env,
+        steps=_whole(given.steps, file.get("steps")),
+        seed=given.seed,
+        num_seeds=given.num_seeds,
+        num_envs=given.num_envs if given.num_envs is not None else file.get("num_envs"),
+        out=given.out,
+        backend=given.backend,
+        preset=given.preset,
+        data=given.data,
+        command=["rtg", *given.arguments],
+        **extra,
+        **_limits(given),
+    )
     _report(given, found)
     if given.profile:
         from ..runner.profile import profile
@@ -78,14 +95,23 @@ def _config_file(path: str) -> dict[str, Any]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RequestError(f"the configuration file {path} is not JSON: {error}") from error
     if not isinstance(data, dict):
-        raise RequestError(f"the configuration file {path} must hold an object with learner, loop, env, steps or num_envs")
+        raise RequestError(
+            f"the configuration file {path} must hold an object with learner, loop, env, steps or num_envs"
+        )
     if "format" in data:
         env = data.get("env", {})
-        data = {"learner": _without_class(data["learner"]), "loop": _without_class(data["loop"]), "steps": data.get("steps"),
-                "env": env.get("kwargs", {}), "num_envs": env.get("num_envs")}
+        data = {
+            "learner": _without_class(data["learner"]),
+            "loop": _without_class(data["loop"]),
+            "steps": data.get("steps"),
+            "env": env.get("kwargs", {}),
+            "num_envs": env.get("num_envs"),
+        }
     unknown = set(data) - {"learner", "loop", "env", "steps", "num_envs"}
     if unknown:
-        raise RequestError(f"the configuration file {path} has an unknown entry {sorted(unknown)[0]!r}: known are learner, loop, env, steps, num_envs")
+        raise RequestError(
+            f"the configuration file {path} has an unknown entry {sorted(unknown)[0]!r}: known are learner, loop, env, steps, num_envs"
+        )
     return data
 
 
@@ -95,8 +121,13 @@ def _without_class(data: dict[str, Any]) -> dict[str, Any]:
 
 def _limits(given: argparse.Namespace) -> dict[str, Any]:
     sinks = [name for name in ("tensorboard", "wandb") if vars(given)[name]]
-    return {"stop_at_return": given.stop_at_return, "time_limit": given.time_limit, "checkpoint_every": given.checkpoint_every,
-            "sinks": sinks, "quiet": given.quiet}
+    return {
+        "stop_at_return": given.stop_at_return,
+        "time_limit": given.time_limit,
+        "checkpoint_every": given.checkpoint_every,
+        "sinks": sinks,
+        "quiet": given.quiet,
+    }
 
 
 def _whole(steps: float | None, other: Any = None) -> Any:
@@ -144,21 +175,33 @@ def _eval(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     del groups
     from ..runner.evaluate_run import evaluate_run
 
-    found = evaluate_run(given.run, episodes=given.episodes, env=given.env, backend=given.backend, checkpoint=given.checkpoint,
-                         stochastic=given.stochastic, seed=given.seed, learner=_learner_for(given.run, given.learner_class))
+    found = evaluate_run(
+        given.run,
+        episodes=given.episodes,
+        env=given.env,
+        backend=given.backend,
+        checkpoint=given.checkpoint,
+        stochastic=given.stochastic,
+        seed=given.seed,
+        learner=_learner_for(given.run, given.learner_class),
+    )
     if given.json:
         print(json.dumps(found))
         return
     low, high = found["return_ci95"]
-    print(f"return {found['return_mean']:.2f} [{low:.2f}, {high:.2f}] (sd {found['return_std']:.2f}) over {found['episodes']} episodes "
-          f"of {found['length_mean']:.1f} steps")
+    print(
+        f"return {found['return_mean']:.2f} [{low:.2f}, {high:.2f}] (sd {found['return_std']:.2f}) over {found['episodes']} episodes "
+        f"of {found['length_mean']:.1f} steps"
+    )
 
 
 def _play(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     del groups
     from ..runner.play import play
 
-    path, total, length = play(given.run, out=given.out, seed=given.seed, checkpoint=given.checkpoint, stochastic=given.stochastic)
+    path, total, length = play(
+        given.run, out=given.out, seed=given.seed, checkpoint=given.checkpoint, stochastic=given.stochastic
+    )
     print(f"{path}   return {total:.1f} in {length} steps")
 
 
@@ -188,7 +231,10 @@ def _check_env(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> 
         for problem in problems:
             print(problem)
         errors = sum(p.severity == "error" for p in problems)
-        print(f"{given.env}: " + ("nothing wrong" if not problems else f"{errors} errors, {len(problems) - errors} warnings"))
+        print(
+            f"{given.env}: "
+            + ("nothing wrong" if not problems else f"{errors} errors, {len(problems) - errors} warnings")
+        )
     if any(p.severity == "error" for p in problems):
         raise RequestError(f"{given.env} cannot be used as it is")
 
@@ -197,7 +243,9 @@ def _collect(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> No
     del groups
     from ..runner.collect import collect_demonstrations
 
-    path, found = collect_demonstrations(given.run, episodes=given.episodes, out=given.out, deterministic=not given.stochastic, seed=given.seed)
+    path, found = collect_demonstrations(
+        given.run, episodes=given.episodes, out=given.out, deterministic=not given.stochastic, seed=given.seed
+    )
     print(json.dumps({"dataset": str(path), **found}) if given.json else f"{path}   {found}")
 
 
@@ -230,10 +278,14 @@ def show_options(algorithm: str) -> None:
         for name, field in options(owner).items():
             span = field.metadata.get("range")
             limits = f"  {span}" if span is not None and str(span) != "(-inf, inf)" else ""
-            print(f"  --{title}.{name.replace('_', '-')} {_shown(field.default)}{limits}\n      {field.metadata['doc']}")
+            print(
+                f"  --{title}.{name.replace('_', '-')} {_shown(field.default)}{limits}\n      {field.metadata['doc']}"
+            )
             if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
                 for inner in options(type(field.default)):
-                    print(f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(field.default, inner))}")
+                    print(
+                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(field.default, inner))}"
+                    )
 
 
 def _shown(value: Any) -> str:
@@ -247,6 +299,14 @@ def _shown(value: Any) -> str:
 
 
 COMMANDS = {
-    "train": _train, "resume": _resume, "eval": _eval, "play": _play, "plot": _plot, "compare": _compare, "check-env": _check_env,
-    "collect": _collect, "export": _export, "figure": _figure,
+    "train": _train,
+    "resume": _resume,
+    "eval": _eval,
+    "play": _play,
+    "plot": _plot,
+    "compare": _compare,
+    "check-env": _check_env,
+    "collect": _collect,
+    "export": _export,
+    "figure": _figure,
 }

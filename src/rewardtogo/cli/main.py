@@ -28,7 +28,10 @@ def _number(text: str) -> float:
 
 
 def _parsers() -> tuple[Parser, dict[str, Parser]]:
-    main = Parser(prog="rtg", description="Deep reinforcement learning, compiled: train, resume, evaluate, watch, compare, export.")
+    main = Parser(
+        prog="rtg",
+        description="Deep reinforcement learning, compiled: train, resume, evaluate, watch, compare, export.",
+    )
     main.add_argument("--version", action="store_true", help="print the version and leave")
     commands = main.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     table: dict[str, Parser] = {}
@@ -42,30 +45,57 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
 
     def limits(parser: Parser) -> None:
         parser.add_argument("--steps", type=_number, help="environment steps (gradient steps offline)")
-        parser.add_argument("--stop-at-return", type=float, metavar="R", help="stop when an evaluation reaches this return")
-        parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after so many seconds of training")
+        parser.add_argument(
+            "--stop-at-return", type=float, metavar="R", help="stop when an evaluation reaches this return"
+        )
+        parser.add_argument(
+            "--time-limit", type=float, metavar="SECONDS", help="stop after so many seconds of training"
+        )
         parser.add_argument("--checkpoint-every", type=float, default=60.0, metavar="SECONDS", help="default 60")
         parser.add_argument("--tensorboard", action="store_true", help="also write TensorBoard events")
         parser.add_argument("--wandb", action="store_true", help="also log to Weights & Biases")
         parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
         parser.add_argument("--json", action="store_true", help="one JSON object as the last line of stdout")
 
-    p = command("train", "train an algorithm in an environment", epilog="`rtg train ALGORITHM ENV --help` shows the algorithm's own options")
+    p = command(
+        "train",
+        "train an algorithm in an environment",
+        epilog="`rtg train ALGORITHM ENV --help` shows the algorithm's own options",
+    )
     p.add_argument("algorithm", metavar="ALGORITHM", help="a name from `rtg list`, or module:Class")
-    p.add_argument("env", metavar="ENV", nargs="?", help="a Gymnasium id (module:Id included) or one of `rtg list --envs`")
+    p.add_argument(
+        "env", metavar="ENV", nargs="?", help="a Gymnasium id (module:Id included) or one of `rtg list --envs`"
+    )
     p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--num-seeds", type=int, default=1, metavar="K", help="train K seeds in one program, one folder each")
+    p.add_argument(
+        "--num-seeds", type=int, default=1, metavar="K", help="train K seeds in one program, one folder each"
+    )
     p.add_argument("--num-envs", type=int, metavar="B", help="environments side by side")
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
     p.add_argument("--backend", default="auto", help="auto, jax (compiled twin) or gymnasium")
-    p.add_argument("--preset", default="auto", metavar="NAME|none", help="hyperparameters known to work (default: those of the pair)")
-    p.add_argument("--config", metavar="FILE", help="a JSON file with learner, loop, env and other options, such as a run's config.json")
+    p.add_argument(
+        "--preset",
+        default="auto",
+        metavar="NAME|none",
+        help="hyperparameters known to work (default: those of the pair)",
+    )
+    p.add_argument(
+        "--config",
+        metavar="FILE",
+        help="a JSON file with learner, loop, env and other options, such as a run's config.json",
+    )
     p.add_argument("--data", metavar="DATASET", help="a dataset to learn from, made by `rtg collect`")
-    p.add_argument("--profile", action="store_true", help="afterwards, say what share of the time collection, learning and evaluation take")
+    p.add_argument(
+        "--profile",
+        action="store_true",
+        help="afterwards, say what share of the time collection, learning and evaluation take",
+    )
     limits(p)
     p = command("resume", "continue a run from its last checkpoint")
     run_argument(p)
-    p.add_argument("--learner-class", metavar="MODULE:CLASS", help="the learner of a run that is not part of the library")
+    p.add_argument(
+        "--learner-class", metavar="MODULE:CLASS", help="the learner of a run that is not part of the library"
+    )
     limits(p)
     p = command("eval", "play whole episodes and print the mean return with its confidence interval")
     run_argument(p)
@@ -126,8 +156,10 @@ def _nested(pairs: Sequence[str], groups: tuple[str, ...]) -> dict[str, dict[str
             raise RequestError(f"what is {word!r} for? Options are written --name value; see --help")
         if steps[0] not in groups or len(steps) < 2:
             known = [a for action in _parsers()[1]["train"]._actions for a in action.option_strings]
-            raise RequestError(f"there is no option {word.partition('=')[0]!r}: "
-                               f"{nearest(word, [*known, '--learner.NAME', '--loop.NAME', '--env.NAME'])} Options of the algorithm are --learner.NAME")
+            raise RequestError(
+                f"there is no option {word.partition('=')[0]!r}: "
+                f"{nearest(word, [*known, '--learner.NAME', '--loop.NAME', '--env.NAME'])} Options of the algorithm are --learner.NAME"
+            )
         i += 1
         values = [value] if equals else []
         while not equals and i < len(pairs) and not (pairs[i].startswith("--") and len(pairs[i]) > 2):
@@ -203,8 +235,11 @@ def _known(parser: Parser, arguments: list[str]) -> argparse.Namespace:
     options, rest = parser.parse_known_args(arguments)
     if rest:
         known = [a for action in parser._actions for a in action.option_strings]
-        raise RequestError(f"there is no option {rest[0]!r} here: {nearest(rest[0], known)}" if rest[0].startswith("-")
-                           else f"what is {rest[0]!r} for? See {parser.prog} --help")
+        raise RequestError(
+            f"there is no option {rest[0]!r} here: {nearest(rest[0], known)}"
+            if rest[0].startswith("-")
+            else f"what is {rest[0]!r} for? See {parser.prog} --help"
+        )
     return options
 
 
@@ -216,15 +251,29 @@ def _list(options: argparse.Namespace) -> int:
         width = max(map(len, ENVIRONMENTS))
         for name, text in ENVIRONMENTS.items():
             print(f"{name:<{width}}  {text}")
-        print("\nBesides these, every Gymnasium id, module:Id included (`python -c 'import gymnasium; gymnasium.pprint_registry()'` lists them).")
+        print("\nBesides these, every Gymnasium id, module:Id included (gymnasium.pprint_registry() lists them).")
         return 0
     if options.json:
-        print(json.dumps({row.name: {"chapter": row.chapter, "number": row.number, "loop": row.loop, "actions": row.actions,
-                                     "summary": row.summary} for row in ALGORITHMS.values()}))
+        print(
+            json.dumps(
+                {
+                    row.name: {
+                        "chapter": row.chapter,
+                        "number": row.number,
+                        "loop": row.loop,
+                        "actions": row.actions,
+                        "summary": row.summary,
+                    }
+                    for row in ALGORITHMS.values()
+                }
+            )
+        )
         return 0
     print(f"{'name':<11}{'chapter':<9}{'number':<8}{'actions':<30}summary")
     for row in ALGORITHMS.values():
-        print(f"{row.name:<11}{row.chapter:<9}{row.number:<8}{'any' if len(row.actions) == 4 else ', '.join(row.actions):<30}{row.summary}")
+        print(
+            f"{row.name:<11}{row.chapter:<9}{row.number:<8}{'any' if len(row.actions) == 4 else ', '.join(row.actions):<30}{row.summary}"
+        )
     return 0
 
 

@@ -7,7 +7,6 @@ from .fields import fix_horizon as fix_horizon
 from .fields import number as number
 from .fields import part as part
 from .fields import setting as setting
-from .fields import value_at as value_at
 from .protocols import Algorithm as Algorithm
 from .protocols import Environment as Environment
 from .protocols import Learner as Learner

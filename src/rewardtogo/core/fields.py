@@ -8,11 +8,12 @@ import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 
@@ -32,13 +33,11 @@ class Schedule(eqx.Module):
         """The least and the greatest value it takes, for range checks."""
 
 
-Number = float | Array | np.ndarray | Schedule
+if TYPE_CHECKING:
+    Number = Any
+else:
+    Number = float | Array | np.ndarray | Schedule
 """What a traced hyperparameter may be: a number, an array of numbers under `vmap`, or a schedule."""
-
-
-def value_at(number: Number, step: Array | int) -> Array:
-    """The value of a hyperparameter after `step` updates, whether it is a number or a schedule."""
-    return number(step) if isinstance(number, Schedule) else number  # type: ignore[return-value]
 
 
 def fix_horizon(tree: Any, horizon: int) -> Any:
@@ -68,11 +67,25 @@ class Range:
 
     def closed(self) -> "Range":
         """The same interval with its ends, which a schedule may come to."""
-        return Range(self.at_least if self.above is None else self.above, self.at_most if self.below is None else self.below)
+        return Range(
+            self.at_least if self.above is None else self.above, self.at_most if self.below is None else self.below
+        )
 
     def __str__(self) -> str:
-        low = f"[{self.at_least:g}" if self.at_least is not None else f"({self.above:g}" if self.above is not None else "(-inf"
-        high = f"{self.at_most:g}]" if self.at_most is not None else f"{self.below:g})" if self.below is not None else "inf)"
+        low = (
+            f"[{self.at_least:g}"
+            if self.at_least is not None
+            else f"({self.above:g}"
+            if self.above is not None
+            else "(-inf"
+        )
+        high = (
+            f"{self.at_most:g}]"
+            if self.at_most is not None
+            else f"{self.below:g})"
+            if self.below is not None
+            else "inf)"
+        )
         return f"{low}, {high}"
 
 
@@ -87,7 +100,9 @@ def number(
 ) -> Any:
     """A traced float hyperparameter: its default, what it means, and the interval it must lie in."""
     span = Range(at_least, at_most, above, below)
-    return eqx.field(default=_as_number(default), converter=_as_number, metadata={"doc": doc, "range": span, "traced": True})
+    return eqx.field(
+        default=_as_number(default), converter=_as_number, metadata={"doc": doc, "range": span, "traced": True}
+    )
 
 
 def setting(
@@ -102,13 +117,17 @@ def setting(
     """A static hyperparameter: its default, what it means, and what it may be."""
     metadata = {"doc": doc, "range": Range(at_least, at_most), "choices": choices, "traced": False}
     keywords: dict[str, Any] = {"default": default, "static": True, "metadata": metadata}
-    return eqx.field(**keywords, **({} if converter is None else {"converter": converter}))
+    if converter is not None:
+        keywords["converter"] = converter
+    return eqx.field(**keywords)
 
 
 def part(default: Any, doc: str, *, converter: Callable[[Any], Any] | None = None) -> Any:
     """A hyperparameter that is itself a module with hyperparameters, such as a network recipe."""
     keywords: dict[str, Any] = {"default": default, "metadata": {"doc": doc, "part": True}}
-    return eqx.field(**keywords, **({} if converter is None else {"converter": converter}))
+    if converter is not None:
+        keywords["converter"] = converter
+    return eqx.field(**keywords)
 
 
 def _as_number(value: Any) -> Any:
@@ -121,6 +140,11 @@ class Configured(eqx.Module):
     Raises `ValueError` naming the field, the value and the range. Traced values cannot be looked at and are not checked.
     """
 
+    def at(self, step: Array | int) -> Self:
+        """The same module with every schedule replaced by its value after `step` updates."""
+        is_schedule = lambda leaf: isinstance(leaf, Schedule)  # noqa: E731
+        return jax.tree.map(lambda x: x(step) if is_schedule(x) else x, self, is_leaf=is_schedule)
+
     def __check_init__(self) -> None:
         for field in dataclasses.fields(self):
             if "doc" in field.metadata:
@@ -129,7 +153,7 @@ class Configured(eqx.Module):
 
 def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
     meta = field.metadata
-    if isinstance(value, jax.core.Tracer) or meta.get("part"):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)) or meta.get("part"):
         return
     span = meta["range"]
     if meta["traced"]:
@@ -141,7 +165,9 @@ def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
             raise ValueError(f"{owner}.{field.name} must be a number in {span} or a schedule, not {value!r}")
     else:
         if meta["choices"] and value not in meta["choices"]:
-            raise ValueError(f"{owner}.{field.name} must be one of {', '.join(map(str, meta['choices']))}, not {value!r}")
+            raise ValueError(
+                f"{owner}.{field.name} must be one of {', '.join(map(str, meta['choices']))}, not {value!r}"
+            )
         wants_int = field.type is int or field.type == "int"
         if wants_int and (isinstance(value, bool) or not isinstance(value, (int, np.integer))):
             raise ValueError(f"{owner}.{field.name} must be a whole number in {span}, not {value!r}")

@@ -5,7 +5,7 @@ trains. Every method is pure, of fixed shape, and can be compiled, scanned and m
 """
 
 from abc import abstractmethod
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import gymnasium.spaces as spaces
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from .fields import Configured
 from .spec import EnvSpec, from_space
-from .types import Action, Batch, Carry, Episodes, Observation, PRNGKey, Rollout, State, Timestep
+from .types import Action, Carry, Episodes, Observation, PRNGKey, State, Timestep
 
 
 class Environment(eqx.Module):
@@ -133,8 +133,8 @@ class Learner(Configured):
         """How it acts now: as it would to learn (`explore`), or as well as it can."""
 
     @abstractmethod
-    def update(self, state: State, batch: Rollout | Batch, key: PRNGKey) -> tuple[State, dict[str, Array], Array | tuple[()]]:
-        """Learn from a batch: new state, scalar metrics, and priorities by sample (or `()`)."""
+    def update(self, state: State, batch: Any, key: PRNGKey) -> tuple[State, dict[str, Array], Array | tuple[()]]:
+        """Learn from a `Rollout` or a `Batch`: new state, scalar metrics, and priorities by sample (or `()`)."""
 
 
 class Algorithm(eqx.Module):
@@ -192,12 +192,12 @@ def env_spec(env: Environment | VectorEnv) -> EnvSpec:
 def require_action(owner: str, spec: EnvSpec, kinds: tuple[str, ...]) -> None:
     """Raise `ValueError` unless the learner `owner` can choose actions of this kind."""
     if spec.action.kind not in kinds:
-        raise ValueError(f"{owner} chooses {' or '.join(k.replace('_', '-') for k in kinds)} actions, and this environment wants "
-                         f"{spec.action.kind.replace('_', '-')} ones: `rtg list` shows the algorithms that can")
+        raise ValueError(
+            f"{owner} chooses {' or '.join(k.replace('_', '-') for k in kinds)} actions, and this environment wants "
+            f"{spec.action.kind.replace('_', '-')} ones: `rtg list` shows the algorithms that can"
+        )
 
 
 def float_metrics(metrics: dict[str, Array]) -> dict[str, Float[Array, ""]]:
     """Metrics as float32 scalars, whatever they were."""
     return {name: jnp.asarray(value, jnp.float32) for name, value in metrics.items()}
-
-

@@ -6,7 +6,7 @@ numbers are 32-bit ones. `from_space` and `to_space` translate at the door.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium.spaces as spaces
 import jax
@@ -56,8 +56,10 @@ class Spec:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of a box, in its shape."""
-        return tuple(np.broadcast_to(np.asarray(b, self.dtype).reshape(self.shape if len(b) > 1 else ()), self.shape)
-                     for b in (self.low, self.high))  # type: ignore[return-value]
+        return tuple(
+            np.broadcast_to(np.asarray(b, self.dtype).reshape(self.shape if len(b) > 1 else ()), self.shape)
+            for b in (self.low, self.high)
+        )  # type: ignore[return-value]
 
     def zeros(self) -> PyTree[Array]:
         """An element-shaped tree of zeros."""
@@ -83,10 +85,15 @@ class Spec:
             return jax.random.uniform(key, self.shape, minval=jnp.asarray(low), maxval=jnp.asarray(high))
         one, two, three = jax.random.split(key, 3)
         tail = jax.random.exponential(one, self.shape)
-        uniform = jax.random.uniform(two, self.shape, minval=np.where(below, low, 0.0), maxval=np.where(above, high, 1.0))
+        uniform = jax.random.uniform(
+            two, self.shape, minval=np.where(below, low, 0.0), maxval=np.where(above, high, 1.0)
+        )
         free = jax.random.normal(three, self.shape)
-        value = jnp.where(below, jnp.where(above, uniform, np.where(below, low, 0.0) + tail),
-                          jnp.where(above, np.where(above, high, 0.0) - tail, free))
+        value = jnp.where(
+            below,
+            jnp.where(above, uniform, np.where(below, low, 0.0) + tail),
+            jnp.where(above, np.where(above, high, 0.0) - tail, free),
+        )
         return value.astype(self.dtype)
 
     def clip(self, value: PyTree[Array]) -> PyTree[Array]:
@@ -108,7 +115,7 @@ class Spec:
             start = np.asarray(self.start).reshape(self.shape) if self.start else None
             return spaces.MultiDiscrete(np.asarray(self.counts).reshape(self.shape), start=start)
         if self.kind == "multi_binary":
-            return spaces.MultiBinary(self.shape if len(self.shape) > 1 else self.shape[0])
+            return spaces.MultiBinary(self.size if len(self.shape) == 1 else self.shape)
         low, high = self.bounds()
         return spaces.Box(low, high, self.shape, np.dtype(self.dtype).type)
 
@@ -124,7 +131,7 @@ class Spec:
         if not isinstance(data, dict) or "kind" not in data or set(data) - known:
             raise ValueError("that is not the description of a space")
         parts = tuple((name, Spec.from_json(part)) for name, part in data.get("parts", {}).items())
-        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items() if k != "parts"}
+        plain: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items() if k != "parts"}
         return Spec(**plain, parts=parts)
 
 
@@ -165,13 +172,20 @@ def from_space(space: spaces.Space) -> Spec:
         return Spec("discrete", (), "int32", counts=(int(space.n),), start=(int(space.start),) if space.start else ())
     if isinstance(space, spaces.MultiDiscrete):
         start = np.asarray(space.start).ravel()
-        return Spec("multi_discrete", tuple(space.nvec.shape), "int32", counts=tuple(int(n) for n in space.nvec.ravel()),
-                    start=tuple(int(s) for s in start) if np.any(start) else ())
+        return Spec(
+            "multi_discrete",
+            tuple(space.nvec.shape),
+            "int32",
+            counts=tuple(int(n) for n in space.nvec.ravel()),
+            start=tuple(int(s) for s in start) if np.any(start) else (),
+        )
     if isinstance(space, spaces.MultiBinary):
         return Spec("multi_binary", tuple(space.shape), "int8")
     if isinstance(space, spaces.Box):
         dtype = {"f": "float32", "i": "int32", "u": "int32", "b": "int8"}[space.dtype.kind]
         dtype = str(space.dtype) if space.dtype in (np.uint8, np.int8) else dtype
         return Spec("box", tuple(space.shape), dtype, low=_short(space.low), high=_short(space.high))
-    raise ValueError(f"a {type(space).__name__} space has no fixed shape, so no learner here can use it: "
-                     "wrap the environment so that it gives Box, Discrete, MultiDiscrete, MultiBinary, Dict or Tuple")
+    raise ValueError(
+        f"a {type(space).__name__} space has no fixed shape, so no learner here can use it: "
+        "wrap the environment so that it gives Box, Discrete, MultiDiscrete, MultiBinary, Dict or Tuple"
+    )

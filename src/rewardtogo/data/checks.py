@@ -43,8 +43,8 @@ def checked(transitions: Transition, spec: EnvSpec) -> dict[str, Any]:
     return fields
 
 
-def require_spec(have: EnvSpec, wanted: EnvSpec) -> None:
-    """Raise `ValueError` unless data with the spaces `have` can be used for an environment with the spaces `wanted`.
+def require_spec(have: EnvSpec, wanted: EnvSpec, owner: str = "the dataset") -> None:
+    """Raise `ValueError` unless data (or a policy) of the spaces `have` fits an environment of the spaces `wanted`.
 
     Bounds of observations do not matter: versions of one environment state them differently.
     """
@@ -54,8 +54,8 @@ def require_spec(have: EnvSpec, wanted: EnvSpec) -> None:
     ):
         if _shape(mine) != _shape(theirs) or (what == "action" and (mine.low, mine.high) != (theirs.low, theirs.high)):
             raise ValueError(
-                f"the dataset's {what} space is {mine.to_space()} and the environment's is {theirs.to_space()}: "
-                "the data is of another environment"
+                f"{owner}'s {what} space is {mine.to_space()} and the environment's is {theirs.to_space()}: "
+                "it is of another environment"
             )
 
 
@@ -81,7 +81,7 @@ def _column(spec: Spec, value: Any, size: int, what: str) -> np.ndarray:
         )
     if array.dtype.kind not in ("biuf" if np.dtype(spec.dtype).kind == "f" else "biu"):
         raise ValueError(
-            f"{what} has the type {array.dtype}, and the space wants {spec.dtype}: the data is of another environment"
+            f"{what} has the type {array.dtype}, and the space wants {spec.dtype}: it is of another environment"
         )
     return np.ascontiguousarray(array, spec.dtype)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core import EnvSpec, PRNGKey, Spec, Transition
+from ..core import MASK, EnvSpec, PRNGKey, Spec, Transition
 from .checks import checked
 from .checks import require_spec as require_spec
 from .files import FORMAT, Damaged, load_tree, read_json, save_tree, sync, write_json
@@ -108,10 +108,12 @@ class Dataset(eqx.Module):
         return self.take(np.sort(order[:first])), self.take(np.sort(order[first:]))
 
     def with_noise(self, noise: float, key: PRNGKey) -> "Dataset":
-        """The same episodes with noise on the recorded actions (`noise.perturb`): a demonstrator who errs."""
+        """The same episodes with noise on the recorded actions (`noise.perturb`): a demonstrator whose labels err."""
         check_noise(self.spec.action, noise)
         keys = jax.random.split(key, self.num_steps)
-        actions = jax.vmap(lambda a, k: perturb(self.spec.action, a, noise, k))(self.transitions.action, keys)
+        t = self.transitions
+        mask = t.observation.get(MASK) if isinstance(t.observation, dict) else None
+        actions = jax.vmap(lambda a, k, m: perturb(self.spec.action, a, noise, k, m))(t.action, keys, mask)
         return eqx.tree_at(lambda d: d.transitions.action, self, actions)
 
 
@@ -142,10 +144,7 @@ def save_dataset(
     Raises `ValueError` where the folder is not empty or cannot be made.
     """
     final = Path(path)
-    if final.exists() and (not final.is_dir() or any(final.iterdir())):
-        raise ValueError(
-            f"{final} exists and is not empty: a dataset is never written over another one; give another folder"
-        )
+    require_new(final)
     temporary = final.with_name(f".{final.name}.tmp")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -178,6 +177,14 @@ def save_dataset(
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     return final
+
+
+def require_new(path: Path) -> None:
+    """Raise `ValueError` unless nothing, or an empty folder, is at `path`."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise ValueError(
+            f"{path} exists and is not empty: a dataset is never written over another one; give another folder"
+        )
 
 
 def load_dataset(path: str | Path) -> Dataset:

@@ -104,8 +104,10 @@ def load_tree(path: Path, like: PyTree) -> PyTree:
     if not metadata.get("format", "").isdigit():
         raise Damaged(f"{path} was not written by rewardtogo")
     if int(metadata["format"]) > FORMAT:
-        raise Damaged(f"{path} has format {metadata['format']}, which is newer than this library's {FORMAT}: "
-                      "install a newer rewardtogo")
+        raise Damaged(
+            f"{path} has format {metadata['format']}, which is newer than this library's {FORMAT}: "
+            "install a newer rewardtogo"
+        )
     leaves = [_restore(path, name, leaf, arrays, metadata) for name, leaf in named_leaves(like).items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
@@ -123,6 +125,8 @@ def _restore(path: Path, name: str, like: Any, arrays: dict[str, np.ndarray], me
     else:
         value = array
     if value.shape != tuple(like.shape) or value.dtype != like.dtype:
-        raise Damaged(f"{path}: {name} is {value.dtype}{list(value.shape)}, and {like.dtype}{list(like.shape)} was "
-                      "expected: it belongs to another algorithm, network or environment")
+        raise Damaged(
+            f"{path}: {name} is {value.dtype}{list(value.shape)}, and {like.dtype}{list(like.shape)} was "
+            "expected: it belongs to another algorithm, network or environment"
+        )
     return jnp.asarray(value)

@@ -13,11 +13,12 @@ EXPERT = "expert_action"
 """Name, in `Transition.extras`, of the action that an expert chose where another one was taken."""
 
 
-def perturb(spec: Spec, action: Action, noise: float | Array, key: PRNGKey) -> Action:
+def perturb(spec: Spec, action: Action, noise: float | Array, key: PRNGKey, mask: Array | None = None) -> Action:
     """One action with noise, still inside its space.
 
     - A box gets Gaussian noise of standard deviation `noise`, in units of half its width (of 1 where it has no bounds).
-    - A choice (each entry, where there are several) is replaced by a uniformly random one with probability `noise`.
+    - A choice (each entry, where there are several) is replaced by a uniformly random one with probability `noise`;
+      one that `mask` forbids is never taken.
     """
     if spec.kind == "box":
         low, high = spec.bounds()
@@ -27,7 +28,10 @@ def perturb(spec: Spec, action: Action, noise: float | Array, key: PRNGKey) -> A
         )
         return spec.clip(action + noise * unit * jax.random.normal(key, spec.shape, jnp.float32))
     replace_key, other_key = jax.random.split(key)
-    other = spec.sample(other_key)
+    if mask is None:
+        other = spec.sample(other_key)
+    else:
+        other = jax.random.categorical(other_key, jnp.where(mask > 0, 0.0, -jnp.inf)).astype(action.dtype)
     return jnp.where(jax.random.uniform(replace_key, spec.shape) < noise, other, action)
 
 

@@ -30,8 +30,10 @@ class UniformReplay(Configured):
         num_envs = example.reward.shape[1]
         rows = self.capacity // (num_envs * unroll) * unroll
         if rows == 0:
-            raise ValueError(f"a replay of {self.capacity} transitions cannot hold one block of {unroll} steps in {num_envs} environments: "
-                             f"give it a capacity of at least {unroll * num_envs}")
+            raise ValueError(
+                f"a replay of {self.capacity} transitions cannot hold one block of {unroll} steps in {num_envs} environments: "
+                f"give it a capacity of at least {unroll * num_envs}"
+            )
         storage = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape[1:]), x.dtype), example)
         return ReplayState(storage, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 

@@ -53,5 +53,6 @@ def dynamics(state: Float[Array, "4"], action: Action) -> Float[Array, "4"]:
     push = (force + moment * spin**2 * sine) / total_mass
     angular = (GRAVITY * sine - cosine * push) / (HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * cosine**2 / total_mass))
     linear = push - moment * angular * cosine / total_mass
-    return jnp.stack([x + TIME_STEP * velocity, velocity + TIME_STEP * linear,
-                      angle + TIME_STEP * spin, spin + TIME_STEP * angular])
+    return jnp.stack(
+        [x + TIME_STEP * velocity, velocity + TIME_STEP * linear, angle + TIME_STEP * spin, spin + TIME_STEP * angular]
+    )

@@ -1,5 +1,4 @@
-"""The far side of the door to Gymnasium: vector environments in NumPy, with one meaning of automatic reset and of
-failure.
+"""The far side of the door to Gymnasium: one meaning of automatic reset and of failure for every vector environment.
 
 NumPy only: JAX inside a callback can deadlock (jax-ml/jax #24255), and callbacks may run on any thread.
 """
@@ -38,6 +37,7 @@ class Host:
     def __init__(self, name: str, envs: vector.VectorEnv, mask: int = 0, extras: tuple[str, ...] = ()) -> None:
         self.name, self.envs, self.mask, self.extras = name, envs, mask, extras
         self.size = envs.num_envs
+        self.same_step = envs.metadata["autoreset_mode"] == vector.AutoresetMode.SAME_STEP
         # Gymnasium prints a worker's traceback once for each copy; what it raises afterwards says the same.
         self.quiet = isinstance(envs.unwrapped, vector.AsyncVectorEnv)
         self.action = Translation(envs.single_action_space)
@@ -85,8 +85,7 @@ class Host:
         return EnvironmentFailure(f"the environment {self.name} {what} in {when} after {self.steps} vector steps{more}")
 
     def _reset(self, seeds: list[int]) -> Any:
-        # Vector environments that are not made of single ones take one seed, as `gymnasium.vector.VectorEnv.reset`
-        # says.
+        # A vector environment that is not made of single ones takes one seed (`gymnasium.vector.VectorEnv.reset`).
         single = isinstance(self.envs.unwrapped, (vector.SyncVectorEnv, vector.AsyncVectorEnv))
         batch, info = self.envs.reset(seed=seeds if single else seeds[0])  # type: ignore[arg-type]
         return self._outcome(self._observe(batch, info, np.ones(self.size, bool), "reset"))
@@ -107,17 +106,10 @@ class Host:
         if not finite.all():
             at = int(np.argmin(finite))
             raise self._failure(f"gave the reward {np.asarray(reward)[at]} (copy {at})", "step")
-        same_step = self.envs.metadata["autoreset_mode"] == vector.AutoresetMode.SAME_STEP
-        end = self._already_reset if same_step else self._then_reset
+        end = self._already_reset if self.same_step else self._then_reset
         observation, final, extras = end(batch, info, terminated | truncated)
-        return (
-            self._outcome(observation),
-            np.asarray(reward, np.float32),
-            terminated,
-            truncated,
-            self._outcome(final),
-            extras,
-        )
+        reward = np.asarray(reward, np.float32)
+        return self._outcome(observation), reward, terminated, truncated, self._outcome(final), extras
 
     def _then_reset(self, batch: Any, info: dict, done: np.ndarray) -> tuple[Parts, Parts, Parts]:
         """Where ended episodes wait for a reset, or would get it in the next step: it happens now, for them alone."""
@@ -154,11 +146,8 @@ class Host:
         final = {name: array.copy() for name, array in observation.items()}
         for name, array in final.items():
             array[rows] = ended[name]
-        return (
-            observation,
-            final,
-            {name: np.where(done, value, extras[name]) for name, value in self._extras(last).items()},
-        )
+        extras = {name: np.where(done, value, extras[name]) for name, value in self._extras(last).items()}
+        return observation, final, extras
 
     def _observe(self, batch: Any, info: dict, masked: np.ndarray, when: str) -> Parts:
         """Checked and translated; the rows `masked` must have an action mask, if there are masks at all."""
@@ -176,9 +165,7 @@ class Host:
     def _mask(self, info: dict, needed: np.ndarray, when: str) -> np.ndarray:
         """Allowed actions `[B, n]`; an ended episode needs none, and without a mask everything is allowed there."""
         mask = np.ones((self.size, self.mask), np.int8)
-        given = (
-            np.asarray(info.get(f"_{MASK}", np.ones(self.size, bool))) if MASK in info else np.zeros(self.size, bool)
-        )
+        given = np.asarray(info.get(f"_{MASK}", np.full(self.size, MASK in info)))
         for row in np.flatnonzero(given):
             mask[row] = info[MASK][row]
         wrong = needed & ~(given & mask.any(1))

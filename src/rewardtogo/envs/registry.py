@@ -1,7 +1,7 @@
 """`make`: any environment, by name or as an object, as B environments side by side."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import gymnasium
 
@@ -9,7 +9,7 @@ from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
 from .cartpole import CartPole
-from .gymnasium import GymnasiumEnv
+from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
 from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
@@ -50,7 +50,9 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
         raise ValueError(f"there is no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if isinstance(env, VectorEnv):
         if num_envs not in (None, env.num_envs):
-            raise ValueError(f"this environment already has {env.num_envs} copies: leave num_envs out, or give one that has {num_envs}")
+            raise ValueError(
+                f"this environment already has {env.num_envs} copies: leave num_envs out, or give one that has {num_envs}"
+            )
         return env
     if isinstance(env, Environment):
         return vectorize(env, num_envs or 1)
@@ -62,7 +64,7 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
             return make(made, num_envs)
         if isinstance(made, gymnasium.Env):
             made.close()
-    return GymnasiumEnv(env, num_envs or 1, kwargs=kwargs)
+    return GymnasiumEnv(cast(Source, env), num_envs or 1, kwargs=kwargs)
 
 
 def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any]) -> VectorEnv:
@@ -71,9 +73,13 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
     if name in COMPILED and backend != "gymnasium" and not kwargs:
         return vectorize(COMPILED[name](), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
-        raise ValueError(f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out")
+        raise ValueError(
+            f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out"
+        )
     if backend == "jax":
-        raise ValueError(f"{name} has no compiled twin: use --backend gymnasium, or one of {', '.join(sorted(COMPILED))}")
+        raise ValueError(
+            f"{name} has no compiled twin: use --backend gymnasium, or one of {', '.join(sorted(COMPILED))}"
+        )
     if name not in gymnasium.registry and ":" not in name:
         if name in COMPILED:
             raise ValueError(f"{name} is not one of Gymnasium's environments: use --backend jax")

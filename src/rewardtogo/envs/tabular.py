@@ -131,7 +131,7 @@ class MDP(eqx.Module):
     def _check_ends(self) -> None:
         if self.discount.ndim or not 0 <= self.discount <= 1:
             raise ValueError(f"discount is {self.discount} and must be one number in [0, 1]")
-        if self.horizon is not None and (isinstance(self.horizon, bool) or self.horizon < 1):
+        if self.horizon is not None and (type(self.horizon) is not int or self.horizon < 1):
             raise ValueError(
                 f"horizon is {self.horizon} and must be a number of actions, at least 1, or None for no end"
             )

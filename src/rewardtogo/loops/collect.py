@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from ..core import (
     Actor,
     Carry,
-    Episodes,
     EnvSpec,
+    Episodes,
     EpisodeStats,
     Observation,
     Policy,
@@ -30,7 +30,9 @@ class RandomPolicy(Policy):
         del key
         return ()
 
-    def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, jax.Array, dict[str, jax.Array]]:
+    def __call__(
+        self, carry: Carry, observation: Observation, key: PRNGKey
+    ) -> tuple[Carry, jax.Array, dict[str, jax.Array]]:
         if isinstance(observation, dict) and "action_mask" in observation:
             logits = jnp.where(observation["action_mask"] > 0, 0.0, -jnp.inf)
             return carry, jax.random.categorical(key, logits).astype(jnp.int32), {}
@@ -57,7 +59,9 @@ def fresh_carry(policy: Policy, key: PRNGKey, num_envs: int) -> Carry:
 
 def reset_where(done: jax.Array, fresh: State, old: State) -> State:
     """`fresh` in the rows where `done`, `old` elsewhere."""
-    return jax.tree.map(lambda new, old: jnp.where(done.reshape(done.shape + (1,) * (old.ndim - done.ndim)), new, old), fresh, old)
+    return jax.tree.map(
+        lambda new, old: jnp.where(done.reshape(done.shape + (1,) * (old.ndim - done.ndim)), new, old), fresh, old
+    )
 
 
 def collect(
@@ -66,7 +70,8 @@ def collect(
     """Take `length` steps in each of B environments.
 
     Returns where the environments stand now, the rollout `[length, B]` with the policy's memory before its first step, and the
-    episodes that ended meanwhile. With `keep_carry` the memory before every step is kept too, as `extras["carry"]`. Memories are reset where an episode ends; actions are clipped into the action space on their way
+    episodes that ended meanwhile. With `keep_carry` the memory before every step is kept
+    too, as `extras["carry"]`. Memories are reset where an episode ends; actions are clipped into the action space on their way
     to the environment and stored as the policy sampled them.
     """
     action_spec = env_spec(env).action
@@ -77,7 +82,9 @@ def collect(
     env_keys = jax.random.split(env_key, (length, num_envs))
     fresh = fresh_carry(policy, carry_key, num_envs)
 
-    def step(loop: tuple[Actor, Episodes], keys: tuple[jax.Array, jax.Array]) -> tuple[tuple[Actor, Episodes], Transition]:
+    def step(
+        loop: tuple[Actor, Episodes], keys: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[Actor, Episodes], Transition]:
         actor, episodes = loop
         carry, action, extras = jax.vmap(lambda c, o, k: policy(c, o, k))(actor.carry, actor.observation, keys[0])
         env_state, timestep = env.step(actor.env_state, action_spec.clip(action), keys[1])
@@ -88,8 +95,15 @@ def collect(
         ended = done.astype(jnp.float32)
         episodes = episodes + Episodes((total * ended).sum(), (steps * ended).sum(), ended.sum())
         stats = EpisodeStats(total * (1.0 - ended), steps * (1.0 - ended))
-        transition = Transition(actor.observation, action, timestep.reward, timestep.terminated, timestep.truncated,
-                                timestep.final_observation, extras)
+        transition = Transition(
+            actor.observation,
+            action,
+            timestep.reward,
+            timestep.terminated,
+            timestep.truncated,
+            timestep.final_observation,
+            extras,
+        )
         actor = Actor(env_state, timestep.observation, reset_where(done, fresh, carry), stats)
         return (actor, episodes), transition
 

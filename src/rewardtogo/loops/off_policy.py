@@ -6,7 +6,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core import Actor, Algorithm, Configured, Episodes, EnvSpec, Learner, Policy, PRNGKey, State, VectorEnv, env_spec, fix_horizon, part, setting
+from ..core import (
+    Actor,
+    Algorithm,
+    Configured,
+    EnvSpec,
+    Episodes,
+    Learner,
+    Policy,
+    PRNGKey,
+    State,
+    VectorEnv,
+    env_spec,
+    fix_horizon,
+    part,
+    setting,
+)
 from ..data.replay import ReplayState, UniformReplay
 from .collect import RandomPolicy, begin, collect
 
@@ -37,13 +52,19 @@ class OffPolicy(Algorithm, Configured):
 
     def __check_init__(self) -> None:
         if self.learner.batch == "rollout":
-            raise ValueError(f"{type(self.learner).__name__} needs fresh rollouts of its own policy, which a replay cannot give: use OnPolicy")
+            raise ValueError(
+                f"{type(self.learner).__name__} needs fresh rollouts of its own policy, which a replay cannot give: use OnPolicy"
+            )
         if self.replay.capacity < self._block:
-            raise ValueError(f"a replay of {self.replay.capacity} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
-                             f"environments: give it a capacity of at least {self._block}")
+            raise ValueError(
+                f"a replay of {self.replay.capacity} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
+                f"environments: give it a capacity of at least {self._block}"
+            )
         if self._sequential and self.replay.capacity // self._block * self.unroll < self.length:
-            raise ValueError(f"a replay of {self.replay.capacity} transitions holds no sequence of {self.length} steps: "
-                             f"give it a capacity of at least {self.length * self.env.num_envs + self._block}")
+            raise ValueError(
+                f"a replay of {self.replay.capacity} transitions holds no sequence of {self.length} steps: "
+                f"give it a capacity of at least {self.length * self.env.num_envs + self._block}"
+            )
 
     @property
     def _block(self) -> int:
@@ -85,7 +106,9 @@ class OffPolicy(Algorithm, Configured):
         actor = begin(self.env, policy, actor_key)
         random = _Carrying(RandomPolicy(self.spec), policy)
         keys = jax.random.split(warm_key, self._warm_up_blocks)
-        _, example, _ = jax.eval_shape(lambda a, k: collect(self.env, policy, a, k, self.unroll, self._sequential), actor, keys[0])
+        _, example, _ = jax.eval_shape(
+            lambda a, k: collect(self.env, policy, a, k, self.unroll, self._sequential), actor, keys[0]
+        )
         replay = self.replay.init(example.transitions, self.unroll)
 
         def block(loop: tuple[Actor, ReplayState], key: PRNGKey) -> tuple[tuple[Actor, ReplayState], None]:

@@ -5,7 +5,21 @@ import dataclasses
 import equinox as eqx
 import jax
 
-from ..core import Actor, Algorithm, Configured, Episodes, EnvSpec, Learner, Policy, PRNGKey, State, VectorEnv, env_spec, fix_horizon, setting
+from ..core import (
+    Actor,
+    Algorithm,
+    Configured,
+    EnvSpec,
+    Episodes,
+    Learner,
+    Policy,
+    PRNGKey,
+    State,
+    VectorEnv,
+    env_spec,
+    fix_horizon,
+    setting,
+)
 from .collect import begin, collect
 
 
@@ -28,8 +42,10 @@ class OnPolicy(Algorithm, Configured):
 
     def __check_init__(self) -> None:
         if self.learner.batch != "rollout":
-            raise ValueError(f"{type(self.learner).__name__} learns from {self.learner.batch}, not from fresh rollouts: "
-                             "use OffPolicy (with environments) or Offline (with a dataset)")
+            raise ValueError(
+                f"{type(self.learner).__name__} learns from {self.learner.batch}, not from fresh rollouts: "
+                "use OffPolicy (with environments) or Offline (with a dataset)"
+            )
 
     @staticmethod
     def default_num_envs() -> int:

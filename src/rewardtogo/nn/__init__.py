@@ -16,6 +16,8 @@ from .network import Linear as Linear
 from .network import Network as Network
 from .network import Torso as Torso
 from .network import as_network as as_network
+from .optimise import Adam as Adam
+from .optimise import global_norm as global_norm
 from .recurrent import GRU as GRU
 from .recurrent import LSTM as LSTM
 from .recurrent import is_recurrent as is_recurrent

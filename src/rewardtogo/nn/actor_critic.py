@@ -31,8 +31,12 @@ class ActorCritic(eqx.Module):
         """Fresh parameters."""
         actor_key, head_key, critic_key, value_key = jax.random.split(key, 4)
         actor, critic = network.build(spec.observation, actor_key), network.build(spec.observation, critic_key)
-        return ActorCritic(actor, ActionHead.of(actor.features, spec.action, head_key), critic,
-                           Linear.of(critic.features, 1, value_key, gain=1.0))
+        return ActorCritic(
+            actor,
+            ActionHead.of(actor.features, spec.action, head_key),
+            critic,
+            Linear.of(critic.features, 1, value_key, gain=1.0),
+        )
 
     def init(self) -> Carry:
         """Both memories at the start of an episode."""
@@ -61,7 +65,9 @@ class ActorCritic(eqx.Module):
         """
         t = rollout.transitions
 
-        def one(carry: Carry, observation: Observation, following: Observation, done: Bool[Array, "T"]) -> tuple[Array, Array]:
+        def one(
+            carry: Carry, observation: Observation, following: Observation, done: Bool[Array, "T"]
+        ) -> tuple[Array, Array]:
             observation, following = jax.vmap(norm)(observation), jax.vmap(norm)(following)
             carries, features = unroll(self.critic, carry, observation, done)
             _, next_features = jax.vmap(lambda c, o: self.critic(c, o))(carries, following)
@@ -71,16 +77,26 @@ class ActorCritic(eqx.Module):
         if not self.recurrent:
             flat = lambda o: jax.vmap(jax.vmap(lambda x: self.value((), norm(x))[1]))(o)  # noqa: E731
             return flat(t.observation), flat(t.next_observation)
-        return jax.vmap(one, in_axes=(0, 1, 1, 1), out_axes=1)(rollout.carry[1], t.observation, t.next_observation, t.done)
+        return jax.vmap(one, in_axes=(0, 1, 1, 1), out_axes=1)(
+            rollout.carry[1], t.observation, t.next_observation, t.done
+        )
 
-    def evaluate(self, carry: Carry, observation: Observation, action: Action, done: Bool[Array, "..."]) -> tuple[Array, Array, Array]:
-        """log pi(a|s), entropy and value of one step; with a memory, of one environment's sequence `[T]`, from the memory before
-        its first step and reset after each end."""
+    def evaluate(
+        self, carry: Carry, observation: Observation, action: Action, done: Bool[Array, "..."]
+    ) -> tuple[Array, Array, Array]:
+        """Log pi(a|s), entropy and value of one step; with a memory, of one environment's sequence `[T]`, from the memory before
+        its first step and reset after each end.
+        """
         if not self.recurrent:
-            distribution, value = self.act(self.actor.init(), observation)[1], self.value(self.critic.init(), observation)[1]
+            distribution, value = (
+                self.act(self.actor.init(), observation)[1],
+                self.value(self.critic.init(), observation)[1],
+            )
             return distribution.log_prob(action), distribution.entropy(), value
 
-        def one(actor_features: Array, critic_features: Array, mask: Array | None, action: Action) -> tuple[Array, Array, Array]:
+        def one(
+            actor_features: Array, critic_features: Array, mask: Array | None, action: Action
+        ) -> tuple[Array, Array, Array]:
             distribution = self.head(actor_features, mask)
             return distribution.log_prob(action), distribution.entropy(), self.value_head(critic_features)[0]
 

@@ -66,7 +66,11 @@ class RunningNorm(eqx.Module):
     @staticmethod
     def of(spec: Spec) -> "RunningNorm":
         """Statistics of nothing yet: standardises with mean 0 and variance 1."""
-        real = {name: jnp.zeros(part.shape) for name, part in input_parts(spec) if part.kind == "box" and part.dtype == "float32"}
+        real = {
+            name: jnp.zeros(part.shape)
+            for name, part in input_parts(spec)
+            if part.kind == "box" and part.dtype == "float32"
+        }
         return RunningNorm(real, jax.tree.map(jnp.zeros_like, real), jnp.zeros(()))
 
     def update(self, observations: Observation) -> "RunningNorm":
@@ -78,7 +82,9 @@ class RunningNorm(eqx.Module):
             new, total = batch.shape[0], self.count + batch.shape[0]
             gap = batch.mean(0) - old
             mean[name] = old + gap * (new / total)
-            square[name] = self.square[name] + ((batch - batch.mean(0)) ** 2).sum(0) + gap**2 * (self.count * new / total)
+            square[name] = (
+                self.square[name] + ((batch - batch.mean(0)) ** 2).sum(0) + gap**2 * (self.count * new / total)
+            )
         return RunningNorm(mean, square, total, self.limit)
 
     def __call__(self, observation: Observation) -> Observation:

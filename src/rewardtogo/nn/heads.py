@@ -40,7 +40,8 @@ class ActionHead(eqx.Module):
             return MultiCategorical(out, self.spec.counts, self.spec.shape)
         if self.spec.kind == "multi_binary":
             return Bernoulli(out.reshape(self.spec.shape))
-        return DiagGaussian(centre(self.spec) + half_width(self.spec) * out.reshape(self.spec.shape), self.log_std)
+        mean = jnp.asarray(centre(self.spec)) + half_width(self.spec) * out.reshape(self.spec.shape)
+        return DiagGaussian(mean, self.log_std)
 
 
 def half_width(spec: Spec) -> np.ndarray:

@@ -5,6 +5,7 @@ so that plain `jit`, `scan`, `vmap` and `grad` take them as they are. A torso ha
 learner serves both kinds.
 """
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +20,12 @@ from ..core import Carry, Observation, PRNGKey, Spec
 from .encoding import flat_size, flatten_observation, flatten_part, has_images, input_parts, leaf
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "tanh": jnp.tanh, "relu": jax.nn.relu, "silu": jax.nn.silu, "gelu": jax.nn.gelu, "elu": jax.nn.elu}
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "silu": jax.nn.silu,
+    "gelu": jax.nn.gelu,
+    "elu": jax.nn.elu,
+}
 
 
 class Linear(eqx.Module):
@@ -103,7 +109,7 @@ class MLP(Network):
             return CNN(sizes=self.sizes).build(spec, key)
         widths = (flat_size(spec), *self.sizes)
         keys = jax.random.split(key, max(1, len(self.sizes)))
-        layers = tuple(Linear.of(*pair, key=k) for pair, k in zip(zip(widths, widths[1:]), keys))  # noqa: B905
+        layers = tuple(Linear.of(*pair, key=k) for pair, k in zip(itertools.pairwise(widths), keys))  # noqa: B905
         return MLPTorso(layers, spec, self.activation)
 
 
@@ -140,10 +146,17 @@ class CNN(Network):
     strides: tuple[int, ...] = eqx.field(static=True)
     sizes: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, channels: tuple[int, ...] = (32, 64, 64), kernels: tuple[int, ...] = (8, 4, 3),
-                 strides: tuple[int, ...] = (4, 2, 1), sizes: tuple[int, ...] = (512,)):
+    def __init__(
+        self,
+        channels: tuple[int, ...] = (32, 64, 64),
+        kernels: tuple[int, ...] = (8, 4, 3),
+        strides: tuple[int, ...] = (4, 2, 1),
+        sizes: tuple[int, ...] = (512,),
+    ):
         if not len(channels) == len(kernels) == len(strides):
-            raise ValueError(f"a CNN needs as many channels as kernels and strides, not {len(channels)}, {len(kernels)} and {len(strides)}")
+            raise ValueError(
+                f"a CNN needs as many channels as kernels and strides, not {len(channels)}, {len(kernels)} and {len(strides)}"
+            )
         self.channels, self.kernels = _sizes(tuple(channels), "channels"), _sizes(tuple(kernels), "kernels")
         self.strides, self.sizes = _sizes(tuple(strides), "strides"), _sizes(tuple(sizes), "the dense sizes")
 
@@ -155,7 +168,9 @@ class CNN(Network):
         images = [(name, part) for name, part in input_parts(spec) if part.is_image]
         others = [(name, part) for name, part in input_parts(spec) if not part.is_image]
         if not images:
-            raise ValueError("a CNN needs pictures, uint8 of [height, width, channels], and this environment has none: use an MLP")
+            raise ValueError(
+                "a CNN needs pictures, uint8 of [height, width, channels], and this environment has none: use an MLP"
+            )
         keys = jax.random.split(key, len(images) + max(1, len(self.sizes)))
         stacks, width = [], sum(flat_size(part) for _, part in others)
         for (_, part), k in zip(images, keys, strict=False):
@@ -163,14 +178,15 @@ class CNN(Network):
             stacks.append(stack)
             width += int(np.prod(shape))
         widths = (width, *self.sizes)
-        layers = tuple(Linear.of(*pair, key=k) for pair, k in zip(zip(widths, widths[1:]), keys[len(images):]))  # noqa: B905
+        layers = tuple(Linear.of(*pair, key=k) for pair, k in zip(itertools.pairwise(widths), keys[len(images) :]))  # noqa: B905
         return CNNTorso(tuple(stacks), layers, self.strides, tuple(images), tuple(others), width)
 
     def _stack(self, shape: tuple[int, ...], key: PRNGKey) -> tuple[tuple[Linear, ...], tuple[int, ...]]:
         height, width, depth = shape
         filters = []
-        for k, channels, kernel, stride in zip(jax.random.split(key, len(self.channels)), self.channels, self.kernels,
-                                               self.strides, strict=True):
+        for k, channels, kernel, stride in zip(
+            jax.random.split(key, len(self.channels)), self.channels, self.kernels, self.strides, strict=True
+        ):
             kernel = min(kernel, height, width)
             filters.append(Linear.of(kernel * kernel * depth, channels, k))
             height, width, depth = (height - kernel) // stride + 1, (width - kernel) // stride + 1, channels
@@ -226,7 +242,9 @@ class Custom(Network):
     static: Any = eqx.field(static=True)
 
     def __init__(self, module: Any):
-        self.module, self.static = eqx.partition(module, eqx.is_array) if isinstance(module, eqx.Module) else (None, module)
+        self.module, self.static = (
+            eqx.partition(module, eqx.is_array) if isinstance(module, eqx.Module) else (None, module)
+        )
 
     @property
     def has_memory(self) -> bool:
@@ -239,9 +257,13 @@ class Custom(Network):
             shape = jax.eval_shape(module, spec.zeros())
         except (TypeError, ValueError) as error:
             first = str(error).strip().splitlines()[0]
-            raise ValueError(f"the network {type(module).__name__} does not take an observation of this environment: {first}") from error
+            raise ValueError(
+                f"the network {type(module).__name__} does not take an observation of this environment: {first}"
+            ) from error
         if not isinstance(shape, jax.ShapeDtypeStruct) or len(shape.shape) != 1:
-            raise ValueError(f"the network {type(module).__name__} must map one observation to one feature vector, not to {shape}")
+            raise ValueError(
+                f"the network {type(module).__name__} must map one observation to one feature vector, not to {shape}"
+            )
         arrays, static = eqx.partition(module, eqx.is_array)
         return CustomTorso(arrays, static, shape.shape[0])
 
@@ -270,4 +292,6 @@ def as_network(network: Any) -> Network:
         return network
     if callable(network):
         return Custom(network)
-    raise ValueError(f"a network is a recipe such as rtg.MLP(64, 64), an Equinox module or a function (spec, key) -> module, not {network!r}")
+    raise ValueError(
+        f"a network is a recipe such as rtg.MLP(64, 64), an Equinox module or a function (spec, key) -> module, not {network!r}"
+    )

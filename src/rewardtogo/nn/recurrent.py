@@ -51,7 +51,9 @@ def _checked(size: int) -> int:
     return size
 
 
-def _build(kind: Literal["gru", "lstm"], gates: int, size: int, encoder: Network, spec: Spec, key: PRNGKey) -> "RecurrentTorso":
+def _build(
+    kind: Literal["gru", "lstm"], gates: int, size: int, encoder: Network, spec: Spec, key: PRNGKey
+) -> "RecurrentTorso":
     encoder_key, input_key, memory_key = jax.random.split(key, 3)
     torso = encoder.build(spec, encoder_key)
     # Each gate is orthogonal by itself, so that no gate starts with more weight than another.
@@ -95,7 +97,9 @@ class RecurrentTorso(Torso):
         return (hidden, cell), hidden
 
 
-def unroll(torso: Torso, carry: Carry, observations: Observation, done: Bool[Array, "T"]) -> tuple[Carry, Float[Array, "T F"]]:
+def unroll(
+    torso: Torso, carry: Carry, observations: Observation, done: Bool[Array, "T"]
+) -> tuple[Carry, Float[Array, "T F"]]:
     """Features of a sequence `[T, ...]`, the memory reset after every step where an episode ended.
 
     Returns the memory after each observation and before any reset, `[T, ...]` (where values of `next_observation` are taken from),

@@ -19,8 +19,21 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core import Action, Carry, EnvSpec, Learner, Number, Observation, PRNGKey, Rollout, number, part, require_action, setting, value_at
-from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Network, RunningNorm, as_network
+from ..core import (
+    Action,
+    Carry,
+    EnvSpec,
+    Learner,
+    Number,
+    Observation,
+    PRNGKey,
+    Rollout,
+    number,
+    part,
+    require_action,
+    setting,
+)
+from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Adam, Network, RunningNorm, as_network, global_norm
 from ..ops.advantages import gae, normalise
 from ..ops.metrics import explained_variance
 
@@ -52,7 +65,9 @@ class PPO(Learner):
     network: Network = part(MLP(64, 64), "recipe of the actor's and of the critic's network", converter=as_network)
     learning_rate: Number = number(3e-4, "Adam's step size", above=0)
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
-    gae_lambda: Number = number(0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1)
+    gae_lambda: Number = number(
+        0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1
+    )
     clip: Number = number(0.2, "eps: how far the ratio may move before its gradient is cut", above=0)
     entropy_cost: Number = number(0.0, "c_H: weight of the entropy bonus", at_least=0)
     value_cost: Number = number(0.5, "c_V: weight of the value loss", at_least=0)
@@ -74,42 +89,43 @@ class PPO(Learner):
         require_action("PPO", spec, self.action_kinds)
         network = ActorCritic.of(self.network, spec, key)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
-        return PPOState(network, self._optimiser(jnp.zeros((), jnp.int32)).init(network), norm, jnp.zeros((), jnp.int32))
+        return PPOState(network, self._optimiser().init(network), norm, jnp.zeros((), jnp.int32))
 
     def policy(self, state: PPOState, explore: bool) -> ActorCriticPolicy:
         return ActorCriticPolicy(state.network, state.norm, explore)
 
     def update(self, state: PPOState, batch: Rollout, key: PRNGKey) -> tuple[PPOState, dict[str, Array], tuple[()]]:
-        samples, value = self._samples(state, batch)
+        now = self.at(state.updates)
+        samples, value = now._samples(state, batch)
         size = len(samples.log_prob)
         per_minibatch = self._minibatch_size(size, state.network.recurrent)
-        optimiser = self._optimiser(state.updates)
-        epsilon, entropy_cost = value_at(self.clip, state.updates), value_at(self.entropy_cost, state.updates)
 
-        def minibatch(loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]) -> tuple[tuple, dict[str, Array]]:
-            network, optimiser_state = loop
+        def minibatch(
+            loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]
+        ) -> tuple[tuple[ActorCritic, optax.OptState], dict[str, Array]]:
+            network, optimiser = loop
             chosen = jax.tree.map(lambda x: x[rows], samples)
-            gradient, metrics = jax.grad(self._loss, has_aux=True)(network, chosen, epsilon, entropy_cost)
-            step, optimiser_state = optimiser.update(gradient, optimiser_state)
-            return (optax.apply_updates(network, step), optimiser_state), metrics | {"grad_norm": optax.global_norm(gradient)}
+            gradient, metrics = jax.grad(now._loss, has_aux=True)(network, chosen)
+            return now._optimiser().step(network, gradient, optimiser), metrics | {"grad_norm": global_norm(gradient)}
 
         used = self.minibatches * per_minibatch
         shuffled = jax.vmap(lambda k: jax.random.permutation(k, size)[:used])(jax.random.split(key, self.epochs))
         loop = (state.network, state.optimiser)
-        (network, optimiser_state), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
+        (network, optimiser), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
         # Statistics change after the update, so that the ratio starts at exactly 1.
         norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
         metrics = jax.tree.map(jnp.mean, metrics) | {"explained_variance": explained_variance(value, samples.target)}
-        return PPOState(network, optimiser_state, norm, state.updates + 1), metrics, ()
+        return PPOState(network, optimiser, norm, state.updates + 1), metrics, ()
 
     def _samples(self, state: PPOState, rollout: Rollout) -> tuple[Samples, Float[Array, "..."]]:
         """Advantages and targets of a rollout, arranged as the loss takes them; and the old values, likewise."""
         t = rollout.transitions
         norm = (lambda x: x) if state.norm is None else state.norm
         value, next_value = state.network.values(rollout, norm)
-        gamma, lam = value_at(self.gamma, state.updates), value_at(self.gae_lambda, state.updates)
-        discount = gamma * (1.0 - t.terminated)
-        advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)(t.reward, discount, value, next_value, lam, t.done)
+        discount = self.gamma * (1.0 - t.terminated)
+        advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)(
+            t.reward, discount, value, next_value, self.gae_lambda, t.done
+        )
         observation = jax.vmap(jax.vmap(norm))(t.observation)
         steps = Samples(observation, t.action, t.extras["log_prob"], advantage, advantage + value, t.done, ())
         if not state.network.recurrent:
@@ -117,31 +133,34 @@ class PPO(Learner):
         steps, value = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (steps, value))
         return eqx.tree_at(lambda s: s.carry, steps, rollout.carry), value
 
-    def _loss(self, network: ActorCritic, s: Samples, epsilon: Array, entropy_cost: Array) -> tuple[Array, dict[str, Array]]:
-        log_prob, entropy, value = jax.vmap(network.evaluate)(s.carry, s.observation, s.action, s.done)
+    def _loss(self, network: ActorCritic, s: Samples) -> tuple[Array, dict[str, Array]]:
+        log_prob, entropy, value = jax.vmap(lambda *step: network.evaluate(*step))(
+            s.carry, s.observation, s.action, s.done
+        )
         advantage = normalise(s.advantage) if self.normalise_advantages else s.advantage
         log_ratio = log_prob - s.log_prob
         ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
+        clipped = jnp.clip(ratio, 1.0 - self.clip, 1.0 + self.clip)
         policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
         value_loss = 0.5 * ((value - s.target) ** 2).mean()
         entropy = entropy.mean()
-        loss = policy_loss + self.value_cost * value_loss - entropy_cost * entropy
+        loss = policy_loss + self.value_cost * value_loss - self.entropy_cost * entropy
         return loss, {
             "policy_loss": policy_loss,
             "value_loss": value_loss,
             "entropy": entropy,
             "approx_kl": (ratio - 1.0 - log_ratio).mean(),
-            "clip_fraction": (jnp.abs(ratio - 1.0) > epsilon).mean(),
+            "clip_fraction": (jnp.abs(ratio - 1.0) > self.clip).mean(),
         }
 
-    def _optimiser(self, updates: Array) -> optax.GradientTransformation:
-        rate = value_at(self.learning_rate, updates)
-        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(rate, eps=1e-5))
+    def _optimiser(self) -> Adam:
+        return Adam(self.learning_rate, self.max_grad_norm, eps=1e-5)
 
     def _minibatch_size(self, size: int, recurrent: bool) -> int:
         if size < self.minibatches:
             what = "environments (a memory needs whole ones)" if recurrent else "steps"
-            raise ValueError(f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
-                             f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}")
+            raise ValueError(
+                f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
+                f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}"
+            )
         return size // self.minibatches

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from ..core import EnvSpec, Learner, Number, PRNGKey, Rollout, number, part, require_action, setting, value_at
-from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Network, RunningNorm, as_network
+from ..core import EnvSpec, Learner, Number, PRNGKey, Rollout, number, part, require_action, setting
+from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Adam, Network, RunningNorm, as_network, global_norm
 from ..ops.advantages import gae, normalise
 from ..ops.metrics import explained_variance
 
@@ -44,7 +44,9 @@ class REINFORCE(Learner):
     entropy_cost: Number = number(0.0, "weight of an entropy bonus", at_least=0)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
     value_updates: int = setting(20, "gradient steps of the value regression on each rollout", at_least=1)
-    baseline: Literal["value", "mean", "none"] = setting("value", "what is subtracted from returns", choices=("value", "mean", "none"))
+    baseline: Literal["value", "mean", "none"] = setting(
+        "value", "what is subtracted from returns", choices=("value", "mean", "none")
+    )
     normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
@@ -60,60 +62,65 @@ class REINFORCE(Learner):
         require_action("REINFORCE", spec, self.action_kinds)
         network = ActorCritic.of(self.network, spec, key)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
-        zero = jnp.zeros((), jnp.int32)
-        policy, value = (optimiser.init(network) for optimiser in self._optimisers(zero))
-        return REINFORCEState(network, policy, value, norm, zero)
+        optimiser = self._optimiser(self.learning_rate).init(network)
+        return REINFORCEState(network, optimiser, optimiser, norm, jnp.zeros((), jnp.int32))
 
     def policy(self, state: REINFORCEState, explore: bool) -> ActorCriticPolicy:
         return ActorCriticPolicy(state.network, state.norm, explore)
 
-    def update(self, state: REINFORCEState, batch: Rollout, key: PRNGKey) -> tuple[REINFORCEState, dict[str, Array], tuple[()]]:
+    def update(
+        self, state: REINFORCEState, batch: Rollout, key: PRNGKey
+    ) -> tuple[REINFORCEState, dict[str, Array], tuple[()]]:
         del key
-        t = batch.transitions
+        now, t = self.at(state.updates), batch.transitions
         norm = (lambda x: x) if state.norm is None else state.norm
         value, next_value = state.network.values(batch, norm)
-        discount = value_at(self.gamma, state.updates) * (1.0 - t.terminated)
+        discount = now.gamma * (1.0 - t.terminated)
         # GAE at lambda = 1 is the Monte-Carlo return less V, continued by V where the return is cut.
-        returns = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)(t.reward, discount, value, next_value, 1.0, t.done) + value
+        monte_carlo = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)
+        returns = monte_carlo(t.reward, discount, value, next_value, 1.0, t.done) + value
         advantage = returns - {"value": value, "mean": returns.mean(), "none": 0.0}[self.baseline]
         advantage = normalise(advantage) if self.normalise_advantages else advantage
-        policy_optimiser, value_optimiser = self._optimisers(state.updates)
-        observation = jax.vmap(jax.vmap(norm))(t.observation)
-        rollout = eqx.tree_at(lambda r: r.transitions.observation, batch, observation)
+        rollout = eqx.tree_at(lambda r: r.transitions.observation, batch, jax.vmap(jax.vmap(norm))(t.observation))
 
         def policy_loss(network: ActorCritic) -> tuple[Array, Array]:
             log_prob, entropy, _ = _evaluate(network, rollout)
-            return -(log_prob * advantage).mean() - value_at(self.entropy_cost, state.updates) * entropy.mean(), entropy.mean()
+            return -(log_prob * advantage).mean() - now.entropy_cost * entropy.mean(), entropy.mean()
 
         def value_loss(network: ActorCritic) -> Float[Array, ""]:
             return 0.5 * ((_evaluate(network, rollout)[2] - returns) ** 2).mean()
 
-        def fit(loop: tuple[ActorCritic, optax.OptState], _: None) -> tuple[tuple, Array]:
+        def fit(
+            loop: tuple[ActorCritic, optax.OptState], _: None
+        ) -> tuple[tuple[ActorCritic, optax.OptState], Float[Array, ""]]:
             network, optimiser = loop
             loss, gradient = jax.value_and_grad(value_loss)(network)
-            step, optimiser = value_optimiser.update(gradient, optimiser)
-            return (optax.apply_updates(network, step), optimiser), loss
+            return now._optimiser(now.value_learning_rate).step(network, gradient, optimiser), loss
 
         (loss, entropy), gradient = jax.value_and_grad(policy_loss, has_aux=True)(state.network)
-        step, policy_state = policy_optimiser.update(gradient, state.policy_optimiser)
-        network = optax.apply_updates(state.network, step)
-        (network, value_state), value_losses = jax.lax.scan(fit, (network, state.value_optimiser), None, self.value_updates)
+        network, policy_state = now._optimiser(now.learning_rate).step(state.network, gradient, state.policy_optimiser)
+        loop = (network, state.value_optimiser)
+        (network, value_state), value_losses = jax.lax.scan(fit, loop, None, self.value_updates)
         norm = None if state.norm is None else state.norm.update(t.observation)
-        metrics = {"policy_loss": loss, "entropy": entropy, "value_loss": value_losses[0], "grad_norm": optax.global_norm(gradient),
-                   "explained_variance": explained_variance(value, returns)}
+        metrics = {
+            "policy_loss": loss,
+            "entropy": entropy,
+            "value_loss": value_losses[0],
+            "grad_norm": global_norm(gradient),
+            "explained_variance": explained_variance(value, returns),
+        }
         return REINFORCEState(network, policy_state, value_state, norm, state.updates + 1), metrics, ()
 
-    def _optimisers(self, updates: Array) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-        clip = optax.clip_by_global_norm(self.max_grad_norm)
-        policy, value = value_at(self.learning_rate, updates), value_at(self.value_learning_rate, updates)
-        return optax.chain(clip, optax.adam(policy)), optax.chain(clip, optax.adam(value))
-
+    def _optimiser(self, rate: Number) -> Adam:
+        return Adam(rate, self.max_grad_norm)
 
 
 def _evaluate(network: ActorCritic, rollout: Rollout) -> tuple[Array, Array, Array]:
-    """log pi(a|s), entropy and value of every step, `[T, B]`; observations are standardised already."""
+    """Log pi(a|s), entropy and value of every step, `[T, B]`; observations are standardised already."""
     t = rollout.transitions
     if network.recurrent:
         whole = jax.vmap(lambda c, o, a, d: network.evaluate(c, o, a, d), in_axes=(0, 1, 1, 1), out_axes=1)
         return whole(rollout.carry, t.observation, t.action, t.done)
-    return jax.vmap(jax.vmap(lambda o, a, d: network.evaluate(network.init(), o, a, d)))(t.observation, t.action, t.done)
+    return jax.vmap(jax.vmap(lambda o, a, d: network.evaluate(network.init(), o, a, d)))(
+        t.observation, t.action, t.done
+    )

@@ -32,7 +32,9 @@ def resolve(path: str) -> Any:
         raise ValueError(f"the module {module!r} of {path!r} cannot be imported: {error}") from error
     for step in name.split("."):
         if step not in vars(found):
-            raise ValueError(f"the module {module!r} has no {name!r}: {nearest(name, [k for k in vars(found) if not k.startswith('_')])}")
+            raise ValueError(
+                f"the module {module!r} has no {name!r}: {nearest(name, [k for k in vars(found) if not k.startswith('_')])}"
+            )
         found = vars(found)[step]
     return found
 
@@ -111,7 +113,9 @@ def _part(where: str, field: dataclasses.Field, value: Any) -> Any:
     default = field.default if field.default is not dataclasses.MISSING else MLP(64)
     name = str(value.get("class", type(default).__name__)).lower()
     if name not in PARTS:
-        raise ValueError(f"{where} cannot be a {value['class']!r} by name: {nearest(name, PARTS)} Others are given from Python.")
+        raise ValueError(
+            f"{where} cannot be a {value['class']!r} by name: {nearest(name, PARTS)} Others are given from Python."
+        )
     base = describe(default) if PARTS[name] is type(default) else {}
     return build(PARTS[name], base | value)
 
@@ -148,7 +152,9 @@ def merge(*layers: dict[str, Any]) -> dict[str, Any]:
             if isinstance(value, dict) and isinstance(old, str):
                 old = {"class": old}
             fresh = isinstance(value, dict) and "class" in value
-            result[name] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) and not fresh else value
+            result[name] = (
+                merge(old, value) if isinstance(old, dict) and isinstance(value, dict) and not fresh else value
+            )
     return result
 
 

@@ -36,7 +36,8 @@ class Moment:
     """What a callback sees between two chunks.
 
     `state` is the algorithm's (with a leading axis of seeds where several train at once), `rows` are the rows of metrics finished
-    since the last moment, `iteration` counts finished iterations, `seconds` is the time spent training, without compilation, evaluation and callbacks.
+    since the last moment, `iteration` counts finished iterations, `seconds` is the
+    time spent training, without compilation, evaluation and callbacks.
     """
 
     algorithm: Algorithm
@@ -85,8 +86,10 @@ class Program:
         self.algorithm, self.key, self.row_every = algorithm, key, row_every
         self.batched = key.ndim == 1
         if self.batched and hosted(algorithm):
-            raise ValueError("several seeds cannot share one compiled program with a Gymnasium environment: train them one after "
-                             "another, or use an environment with a compiled twin (`rtg list --envs`)")
+            raise ValueError(
+                "several seeds cannot share one compiled program with a Gymnasium environment: train them one after "
+                "another, or use an environment with a compiled twin (`rtg list --envs`)"
+            )
         self.compile_seconds = 0.0
         self._names: list[str] = []
         self._advance: Any = None
@@ -103,12 +106,16 @@ class Program:
 
     def shapes(self) -> State:
         """Structure, shapes and types of the state, without computing it."""
-        return jax.eval_shape(self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key)
+        return jax.eval_shape(
+            self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key
+        )
 
     def init(self) -> State:
         """A fresh state: one compiled program, because op by op costs seconds."""
         # The key of `init` lies outside the range of iterations, so that no iteration repeats it.
-        program = self._compile(self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key)
+        program = self._compile(
+            self._over_seeds(lambda a, k: a.init(jax.random.fold_in(k, 2**31 - 1))), self.algorithm, self.key
+        )
         return self.guarded(lambda: program(self.algorithm, self.key))
 
     def fresh_sums(self, state: State) -> Array:
@@ -135,12 +142,27 @@ class Program:
         if self._advance is None:
             self._table_shape(state)
             function = partial(self._chunk, structure, tuple(large))
-            self._advance = self._compile(function, self.algorithm, big, small, sums, self.key, 0, 0, 1, donate_argnums=1)
-        new, sums, table = self.guarded(lambda: self._advance(self.algorithm, big, small, sums, self.key, start, stop, self.row_every))
+            self._advance = self._compile(
+                function, self.algorithm, big, small, sums, self.key, 0, 0, 1, donate_argnums=1
+            )
+        new, sums, table = self.guarded(
+            lambda: self._advance(self.algorithm, big, small, sums, self.key, start, stop, self.row_every)
+        )
         return jax.tree.unflatten(structure, new), sums, np.asarray(table)
 
-    def _chunk(self, structure: Any, large: tuple[bool, ...], algorithm: Algorithm, big: list, small: list, sums: Array, key: Array,
-               start: Array, stop: Array, every: Array) -> tuple[list, Array, Array]:
+    def _chunk(
+        self,
+        structure: Any,
+        large: tuple[bool, ...],
+        algorithm: Algorithm,
+        big: list,
+        small: list,
+        sums: Array,
+        key: Array,
+        start: Array,
+        stop: Array,
+        every: Array,
+    ) -> tuple[list, Array, Array]:
         heavy, light = iter(big), iter(small)
         state = jax.tree.unflatten(structure, [next(heavy) if is_large else next(light) for is_large in large])
         step, fold = self._over_seeds_step(), jax.random.fold_in
@@ -149,7 +171,10 @@ class Program:
         def iteration(i: Array, loop: tuple[State, Array]) -> tuple[State, Array]:
             state, sums = loop
             state, (metrics, episodes) = step(algorithm, state, fold(key, i))
-            values = [*(metrics[name] for name in sorted(metrics)), *(getattr(episodes, f.name) for f in dataclasses.fields(Episodes))]
+            values = [
+                *(metrics[name] for name in sorted(metrics)),
+                *(getattr(episodes, f.name) for f in dataclasses.fields(Episodes)),
+            ]
             return state, sums + jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
 
         def row(r: Array, loop: tuple[State, Array, Array]) -> tuple[State, Array, Array]:
@@ -170,8 +195,13 @@ class Program:
             sums = dict(zip(self._names, table[r - start // self.row_every], strict=True))
             count = sums["count"]
             with np.errstate(invalid="ignore", divide="ignore"):
-                row = {"iteration": (r + 1) * self.row_every, "env_steps": steps_after(self.algorithm, (r + 1) * self.row_every),
-                       "return_mean": sums["return_sum"] / count, "length_mean": sums["length_sum"] / count, "episodes": count}
+                row = {
+                    "iteration": (r + 1) * self.row_every,
+                    "env_steps": steps_after(self.algorithm, (r + 1) * self.row_every),
+                    "return_mean": sums["return_sum"] / count,
+                    "length_mean": sums["length_sum"] / count,
+                    "episodes": count,
+                }
             metrics = self._names[: -len(dataclasses.fields(Episodes))]
             found.append(row | {name: sums[name] / self.row_every for name in metrics})
         return found
@@ -181,16 +211,20 @@ class Program:
         for row in rows:
             for name in self._names[: -len(dataclasses.fields(Episodes))]:
                 if not np.all(np.isfinite(row[name])):
-                    raise NonFinite(f"{name} is no longer a finite number at iteration {row['iteration']} ({row['env_steps']} steps): "
-                                    "lower the learning rate or look at the rewards; the last good checkpoint is kept")
+                    raise NonFinite(
+                        f"{name} is no longer a finite number at iteration {row['iteration']} ({row['env_steps']} steps): "
+                        "lower the learning rate or look at the rewards; the last good checkpoint is kept"
+                    )
         learned = self.algorithm.learned(state)
         if self._check is None:
             self._check = self._compile(_all_finite, learned)
         finite = self._check(learned)
         for path, good in jax.tree_util.tree_leaves_with_path(finite):
             if not good:
-                raise NonFinite(f"the parameter {jax.tree_util.keystr(path)} is no longer finite: "
-                                "lower the learning rate or look at the rewards; the last good checkpoint is kept")
+                raise NonFinite(
+                    f"the parameter {jax.tree_util.keystr(path)} is no longer finite: "
+                    "lower the learning rate or look at the rewards; the last good checkpoint is kept"
+                )
 
     def guarded(self, call: Callable[[], Any]) -> Any:
         """Run a compiled call to its end; an error inside a foreign environment comes out as its own sentence."""
@@ -243,7 +277,13 @@ def run(
     history: list[dict[str, Any]] = []
     pace, seconds, stop = None, 0.0, False
     while done < iterations and not stop:
-        until = min([iterations, *((done // mark + 1) * mark for mark in marks), (done // row_every + ROWS_PER_CHUNK) * row_every])
+        until = min(
+            [
+                iterations,
+                *((done // mark + 1) * mark for mark in marks),
+                (done // row_every + ROWS_PER_CHUNK) * row_every,
+            ]
+        )
         length = 1 if pace is None else max(1, min(until - done, int(chunk_seconds / pace)))
         compiling, started = program.compile_seconds, time.perf_counter()
         state, sums, table = program.advance(state, sums, done, done + length)
@@ -265,4 +305,14 @@ def run(
     return state, {name: np.asarray([row[name] for row in history]) for name in names}
 
 
-__all__ = ["Callback", "EnvironmentFailure", "Every", "Moment", "NonFinite", "Program", "iterations_for", "run", "steps_after"]
+__all__ = [
+    "Callback",
+    "EnvironmentFailure",
+    "Every",
+    "Moment",
+    "NonFinite",
+    "Program",
+    "iterations_for",
+    "run",
+    "steps_after",
+]

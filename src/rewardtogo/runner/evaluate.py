@@ -52,7 +52,11 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
         done = timestep.done
         total, length = actor.stats.return_so_far + timestep.reward, actor.stats.length_so_far + 1.0
         here = (jnp.arange(quota, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
-        found = Returns(jnp.where(here, total[None, :], found.returns), jnp.where(here, length[None, :], found.lengths), found.finished + done)
+        found = Returns(
+            jnp.where(here, total[None, :], found.returns),
+            jnp.where(here, length[None, :], found.lengths),
+            found.finished + done,
+        )
         stats = type(actor.stats)(jnp.where(done, 0.0, total), jnp.where(done, 0.0, length))
         return Actor(env_state, timestep.observation, reset_where(done, fresh, carry), stats), found, step + 1
 
@@ -86,8 +90,10 @@ class Evaluator:
             failure = failure_of(self.env)
             raise (failure or error) from (error if failure else None)
         if np.any(found.finished < self.quota):
-            raise ValueError(f"an episode of this environment did not end within {MAX_STEPS * self.quota} steps, so it has no return: "
-                             "give the environment a time limit (gymnasium.make(..., max_episode_steps=N), or rtg.envs.TimeLimit)")
+            raise ValueError(
+                f"an episode of this environment did not end within {MAX_STEPS * self.quota} steps, so it has no return: "
+                "give the environment a time limit (gymnasium.make(..., max_episode_steps=N), or rtg.envs.TimeLimit)"
+            )
         flat = (*found.returns.shape[:-2], -1)
         return found.returns.reshape(flat), found.lengths.reshape(flat)
 
@@ -98,7 +104,9 @@ def lanes_for(episodes: int, compiled: bool) -> int:
     return max(n for n in range(1, min(most, episodes) + 1) if episodes % n == 0)
 
 
-def confidence(values: np.ndarray, statistic: Callable[..., np.ndarray] = np.mean, level: float = 0.95) -> tuple[float, float]:
+def confidence(
+    values: np.ndarray, statistic: Callable[..., np.ndarray] = np.mean, level: float = 0.95
+) -> tuple[float, float]:
     """Percentile bootstrap interval of a statistic of independent values (Efron 1979), the same for the same values."""
     values = np.asarray(values, np.float64)
     if len(values) < 2:

@@ -1,6 +1,6 @@
 """The run folder: one run, everything it needs to be read, evaluated, resumed, in arrays, JSON and CSV.
 
-    config.json  metrics.csv  evaluation.json  policy.safetensors + policy.json  best/  checkpoints/NNNNNNNN/  curve.png
+config.json  metrics.csv  evaluation.json  policy.safetensors + policy.json  best/  checkpoints/NNNNNNNN/  curve.png
 """
 
 import contextlib
@@ -33,8 +33,10 @@ def new_folders(out: str | None, algorithm: str, env: str, seeds: Sequence[int])
         if out is not None:
             base = Path(out)
             if base.exists() and (not base.is_dir() or any(base.iterdir())):
-                raise ValueError(f"{base} exists and is not empty: a run is never written over another one; "
-                                 "give another --out, or continue this one with `rtg resume`")
+                raise ValueError(
+                    f"{base} exists and is not empty: a run is never written over another one; "
+                    "give another --out, or continue this one with `rtg resume`"
+                )
             base.mkdir(parents=True, exist_ok=True)
             folders = [base] if len(seeds) == 1 else [base / f"seed-{seed}" for seed in seeds]
             for folder in folders:
@@ -79,8 +81,20 @@ class RunFolder:
         if not isinstance(data, dict) or not isinstance(data.get("format"), int):
             raise Damaged(f"{file} is not a run's configuration")
         if data["format"] > FORMAT:
-            raise Damaged(f"{file} has format {data['format']}, which is newer than this library's {FORMAT}: install a newer rewardtogo")
-        missing = {"algorithm", "env", "learner", "loop", "seed", "steps", "iterations", "row_every", "eval_every"} - set(data)
+            raise Damaged(
+                f"{file} has format {data['format']}, which is newer than this library's {FORMAT}: install a newer rewardtogo"
+            )
+        missing = {
+            "algorithm",
+            "env",
+            "learner",
+            "loop",
+            "seed",
+            "steps",
+            "iterations",
+            "row_every",
+            "eval_every",
+        } - set(data)
         if missing:
             raise Damaged(f"{file} is damaged: it has no {sorted(missing)[0]!r}")
         return data
@@ -181,7 +195,10 @@ class RunFolder:
             raise Damaged(f"{self.metrics_file} is damaged: it has no columns env_steps and return_mean")
         body = [row for row in rows[1:] if len(row) == len(rows[0])]
         try:
-            return {name: np.asarray([float(row[i]) if row[i] else np.nan for row in body]) for i, name in enumerate(rows[0])}
+            return {
+                name: np.asarray([float(row[i]) if row[i] else np.nan for row in body])
+                for i, name in enumerate(rows[0])
+            }
         except ValueError as error:
             raise Damaged(f"{self.metrics_file} is damaged: {error}") from error
 
@@ -189,4 +206,8 @@ class RunFolder:
 def _cell(value: Any) -> str:
     if value is None or (isinstance(value, (float, np.floating)) and np.isnan(value)):
         return ""
-    return str(int(value)) if isinstance(value, (int, np.integer)) or float(value).is_integer() and abs(value) < 2**53 else f"{float(value):.9g}"
+    return (
+        str(int(value))
+        if isinstance(value, (int, np.integer)) or (float(value).is_integer() and abs(value) < 2**53)
+        else f"{float(value):.9g}"
+    )

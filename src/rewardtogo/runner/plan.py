@@ -30,7 +30,7 @@ class Plan:
     """One run, ready to be executed. `config` is what `config.json` says of it; `env` is None offline without an environment."""
 
     algorithm: Algorithm
-    learner: Learner
+    learner: Learner | None
     env: VectorEnv | None
     eval_env: VectorEnv | None
     config: dict[str, Any]
@@ -69,24 +69,36 @@ def plan(
     check_budget(steps, seed)
     if isinstance(algorithm, Algorithm):
         if learner or loop:
-            raise ValueError("an algorithm that is put together already takes no options for its learner or loop: set them where it was made")
+            raise ValueError(
+                "an algorithm that is put together already takes no options for its learner or loop: set them where it was made"
+            )
         whole, inner = algorithm, _learner_of(algorithm)
         vector_env: VectorEnv | None = _env_of(algorithm)
     else:
         inner = _learner(algorithm, merge(ready.get("learner", {}), learner or {}))
         options = merge(ready.get("loop", {}), loop or {})
-        kind = algorithm_row(name).loop if name in ALGORITHMS else ("on_policy" if inner.batch == "rollout" else "off_policy")
+        kind = (
+            algorithm_row(name).loop
+            if name in ALGORITHMS
+            else ("on_policy" if inner.batch == "rollout" else "off_policy")
+        )
         if data is not None:
             kind = "offline"
         cls = resolve(LOOPS[kind])
         if kind == "offline":
             if data is None:
-                raise ValueError(f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data")
+                raise ValueError(
+                    f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
+                )
             dataset = load_dataset(data) if isinstance(data, str) else data
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
             whole = build(cls, options, dataset=dataset, learner=inner)
         else:
-            number = num_envs if num_envs is not None or not isinstance(env, (str, Environment)) else ready.get("num_envs", cls.default_num_envs())
+            number = (
+                num_envs
+                if num_envs is not None or not isinstance(env, (str, Environment))
+                else ready.get("num_envs", cls.default_num_envs())
+            )
             vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
             whole = build(cls, options, env=vector_env, learner=inner)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
@@ -97,34 +109,52 @@ def plan(
     inner = _learner_of(whole) if inner is not None else None
     config = {
         "algorithm": name,
-        "env": {"id": env_name, "backend": _backend(vector_env), "num_envs": vector_env.num_envs if vector_env is not None else 0,
-                "kwargs": env_kwargs or {}, "by_name": isinstance(env, str)},
+        "env": {
+            "id": env_name,
+            "backend": _backend(vector_env),
+            "num_envs": vector_env.num_envs if vector_env is not None else 0,
+            "kwargs": env_kwargs or {},
+            "by_name": isinstance(env, str),
+        },
         "learner": describe(inner) if inner is not None else {},
         "loop": describe(whole),
         "data": data if isinstance(data, str) else None,
-        "seed": seed, "steps": steps_after(whole, iterations), "iterations": iterations, "row_every": row_every,
-        "eval_every": eval_every, "eval_episodes": eval_episodes, "versions": versions(),
+        "seed": seed,
+        "steps": steps_after(whole, iterations),
+        "iterations": iterations,
+        "row_every": row_every,
+        "eval_every": eval_every,
+        "eval_episodes": eval_episodes,
+        "versions": versions(),
     }
-    return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs or {}, eval_episodes), config)
+    return Plan(
+        whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs or {}, eval_episodes), config
+    )
 
 
 def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, learner: Learner | None = None) -> Plan:
     """The run that a folder's configuration describes, with a longer budget if `steps` is given."""
     described = config["env"]
     if env is None and not described["by_name"] and described["num_envs"]:
-        raise ValueError(f"the run was made with an environment object ({described['id']}), which a file cannot hold: "
-                         "resume it from Python with rtg.resume(path, env=...)")
+        raise ValueError(
+            f"the run was made with an environment object ({described['id']}), which a file cannot hold: "
+            "resume it from Python with rtg.resume(path, env=...)"
+        )
     source = described["id"] if env is None else env
     inner = restore_learner({"algorithm": config["algorithm"], "learner": config["learner"]}, learner)
     kind = config["loop"]["class"]
     if kind not in LOOPS.values() and kind not in {path.replace(":", ":") for path in LOOPS.values()}:
-        raise ValueError(f"the run was made with {kind}, which is not one of the library's loops: resume it from Python with rtg.run")
+        raise ValueError(
+            f"the run was made with {kind}, which is not one of the library's loops: resume it from Python with rtg.run"
+        )
     cls = resolve(kind)
     backend = described["backend"]
     eval_env: VectorEnv | None
     if kind == LOOPS["offline"]:
         if config["data"] is None:
-            raise ValueError("the run was made with a dataset object, which a file cannot hold: it cannot be resumed by name")
+            raise ValueError(
+                "the run was made with a dataset object, which a file cannot hold: it cannot be resumed by name"
+            )
         vector_env = make(source, 1, backend=backend, **described["kwargs"]) if described["num_envs"] else None
         whole: Algorithm = build(cls, config["loop"], dataset=load_dataset(config["data"]), learner=inner)
     else:
@@ -135,7 +165,9 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
         check_budget(steps, config["seed"])
         iterations = iterations_for(whole, steps)
         if iterations < config["iterations"]:
-            raise ValueError(f"the run's budget is {config['steps']} steps already: --steps can extend it, and {steps} is less")
+            raise ValueError(
+                f"the run's budget is {config['steps']} steps already: --steps can extend it, and {steps} is less"
+            )
         config |= {"iterations": iterations, "steps": steps_after(whole, iterations)}
     eval_env = _evaluation_env(source, vector_env, backend, described["kwargs"], config["eval_episodes"])
     return Plan(whole, inner, vector_env, eval_env, config)
@@ -143,7 +175,9 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
 
 def check_budget(steps: Any, seed: Any) -> None:
     """Raise `ValueError` unless steps and seed are whole numbers that make sense."""
-    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, float)) or not math.isfinite(steps) or steps < 1):
+    if steps is not None and (
+        isinstance(steps, bool) or not isinstance(steps, (int, float)) or not math.isfinite(steps) or steps < 1
+    ):
         raise ValueError(f"the number of steps must be at least 1, not {steps}")
     if steps is not None and steps > 1e15:
         raise ValueError(f"{steps:g} steps would take centuries: give at most 1e15")
@@ -155,8 +189,14 @@ def versions() -> dict[str, str]:
     """What made a run."""
     from .. import __version__
 
-    return {"rewardtogo": __version__, "jax": jax.__version__, "gymnasium": gymnasium.__version__,
-            "python": platform.python_version(), "device": jax.devices()[0].platform, "system": platform.system()}
+    return {
+        "rewardtogo": __version__,
+        "jax": jax.__version__,
+        "gymnasium": gymnasium.__version__,
+        "python": platform.python_version(),
+        "device": jax.devices()[0].platform,
+        "system": platform.system(),
+    }
 
 
 def _preset(choice: str, algorithm: str, env: str) -> dict[str, Any]:
@@ -214,7 +254,9 @@ def _backend(env: VectorEnv | None) -> str:
     return "gymnasium" if hosted(env) else "jax"
 
 
-def _evaluation_env(source: Any, env: VectorEnv | None, backend: str, kwargs: dict[str, Any], episodes: int) -> VectorEnv | None:
+def _evaluation_env(
+    source: Any, env: VectorEnv | None, backend: str, kwargs: dict[str, Any], episodes: int
+) -> VectorEnv | None:
     """Environments of its own for evaluation; None where the only one there is is being trained in."""
     if source is None or env is None:
         return None
@@ -223,4 +265,9 @@ def _evaluation_env(source: Any, env: VectorEnv | None, backend: str, kwargs: di
     if isinstance(source, VectorEnv) or isinstance(source, (gymnasium.Env, gymnasium.vector.VectorEnv)):
         return None if hosted(env) else env
     compiled = not hosted(env)
-    return make(source, lanes_for(episodes, compiled), backend="gymnasium" if source in COMPILED and not compiled else backend, **kwargs)
+    return make(
+        source,
+        lanes_for(episodes, compiled),
+        backend="gymnasium" if source in COMPILED and not compiled else backend,  # type: ignore[arg-type]
+        **kwargs,
+    )

@@ -42,10 +42,19 @@ def draw_curves(paths: Sequence[str | Path], out: str | Path) -> Path:
         grid = np.linspace(max(c[0][0] for c in curves), min(c[0][-1] for c in curves), 200)
         table = np.stack([np.interp(grid, *c) for c in curves])
         label = name if len(curves) == 1 else f"{name} ({len(curves)} seeds)"
-        (line,) = axes.plot(*curves[0], label=label) if len(curves) == 1 else axes.plot(grid, table.mean(0), label=label)
+        (line,) = (
+            axes.plot(*curves[0], label=label) if len(curves) == 1 else axes.plot(grid, table.mean(0), label=label)
+        )
         if len(curves) > 1:
             spread = table.std(0, ddof=1) / np.sqrt(len(curves))
-            axes.fill_between(grid, table.mean(0) - 1.96 * spread, table.mean(0) + 1.96 * spread, alpha=0.25, color=line.get_color(), lw=0)
+            axes.fill_between(
+                grid,
+                table.mean(0) - 1.96 * spread,
+                table.mean(0) + 1.96 * spread,
+                alpha=0.25,
+                color=line.get_color(),
+                lw=0,
+            )
     if not axes.lines:
         axes.text(0.5, 0.5, "no episode has ended yet", ha="center", va="center", transform=axes.transAxes)
     else:

@@ -16,8 +16,13 @@ from .config import build, describe, resolve
 def save_policy(folder: Path, learner: Learner, state: Any, spec: EnvSpec, about: dict[str, Any]) -> None:
     """Write the policies that a learner's state holds, the one that explores and the one that does not."""
     folder.mkdir(parents=True, exist_ok=True)
-    data = {"format": FORMAT, **about, "learner": describe(learner),
-            "observation": spec.observation.to_json(), "action": spec.action.to_json()}
+    data = {
+        "format": FORMAT,
+        **about,
+        "learner": describe(learner),
+        "observation": spec.observation.to_json(),
+        "action": spec.action.to_json(),
+    }
     save_tree(folder / "policy.safetensors", policies(learner, state), {"content": "policy"})
     write_json(folder / "policy.json", data)
 
@@ -31,12 +36,16 @@ def read_policy_json(folder: Path) -> dict[str, Any]:
     """The description of a policy. Raises `Damaged` where it is missing, newer or no policy's."""
     path = folder / "policy.json"
     if not path.exists():
-        raise Damaged(f"{folder} holds no policy.json: it is not a run folder, or its run has not finished its first evaluation")
+        raise Damaged(
+            f"{folder} holds no policy.json: it is not a run folder, or its run has not finished its first evaluation"
+        )
     data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("format"), int) or "learner" not in data:
         raise Damaged(f"{path} is not the description of a policy")
     if data["format"] > FORMAT:
-        raise Damaged(f"{path} has format {data['format']}, which is newer than this library's {FORMAT}: install a newer rewardtogo")
+        raise Damaged(
+            f"{path} has format {data['format']}, which is newer than this library's {FORMAT}: install a newer rewardtogo"
+        )
     return data
 
 
@@ -44,8 +53,10 @@ def learner_class(name: str, data: dict[str, Any]) -> type[Learner]:
     """The class of a learner that a file describes: one of ours, by the catalogue. A file never makes us import anything else."""
     ours = {row.path: row for row in ALGORITHMS.values()}
     if name not in ALGORITHMS and data.get("class") not in ours:
-        raise ValueError(f"the run was made with {data.get('class')}, which is not part of rewardtogo, and a file is not allowed to "
-                         "name code to run: give the learner yourself (rtg.load(path, learner=...), or --learner-class module:Class)")
+        raise ValueError(
+            f"the run was made with {data.get('class')}, which is not part of rewardtogo, and a file is not allowed to "
+            "name code to run: give the learner yourself (rtg.load(path, learner=...), or --learner-class module:Class)"
+        )
     return resolve(ALGORITHMS[name].path if name in ALGORITHMS else data["class"])
 
 
@@ -69,8 +80,14 @@ class LoadedPolicy:
         self._key = jax.random.key(0)
         self._carry: Any = None
         self._batch: int | None = None
-        self._act = jax.jit(lambda policy, carry, observation, keys: jax.vmap(lambda c, o, k: policy(c, o, k)[:2])(carry, observation, keys))
-        self._inspect = jax.jit(lambda policy, carry, observation: jax.vmap(lambda c, o: policy.inspect(c, o))(carry, observation))
+        self._act = jax.jit(
+            lambda policy, carry, observation, keys: jax.vmap(lambda c, o, k: policy(c, o, k)[:2])(
+                carry, observation, keys
+            )
+        )
+        self._inspect = jax.jit(
+            lambda policy, carry, observation: jax.vmap(lambda c, o: policy.inspect(c, o))(carry, observation)
+        )
 
     def reset(self, seed: int | None = None) -> None:
         """Forget the episode; with `seed`, also start the random actions anew."""
@@ -113,7 +130,9 @@ class LoadedPolicy:
         missing = [name for name, _ in spec.parts if name not in flat]
         if missing:
             hint = f" (a mask of the allowed actions: {MASK})" if MASK in missing else ""
-            raise ValueError(f"the observation has no part {missing[0]!r}{hint}: this policy takes {', '.join(n for n, _ in spec.parts)}")
+            raise ValueError(
+                f"the observation has no part {missing[0]!r}{hint}: this policy takes {', '.join(n for n, _ in spec.parts)}"
+            )
         parts = {name: _element(part, flat[name], name) for name, part in spec.parts}
         batched = any(b for _, b in parts.values())
         return {name: value if batched else value[None] for name, (value, _) in parts.items()}, batched
@@ -133,7 +152,9 @@ def _flatten(tree: Any, name: str = "") -> dict[str, Any]:
         tree = {str(i): part for i, part in enumerate(tree)}
     if not isinstance(tree, dict):
         return {name: tree}
-    return {k: v for key, part in tree.items() for k, v in _flatten(part, f"{name}.{key}" if name else str(key)).items()}
+    return {
+        k: v for key, part in tree.items() for k, v in _flatten(part, f"{name}.{key}" if name else str(key)).items()
+    }
 
 
 def _element(spec: Spec, value: Any, name: str) -> tuple[np.ndarray, bool]:
@@ -142,8 +163,10 @@ def _element(spec: Spec, value: Any, name: str) -> tuple[np.ndarray, bool]:
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{what} is not made of numbers: it has type {array.dtype}")
     if array.shape != spec.shape and array.shape[1:] != spec.shape:
-        raise ValueError(f"{what} has shape {array.shape}, and this policy was trained on {spec.shape} (or a batch of these): "
-                         "it belongs to another environment")
+        raise ValueError(
+            f"{what} has shape {array.shape}, and this policy was trained on {spec.shape} (or a batch of these): "
+            "it belongs to another environment"
+        )
     if array.dtype.kind == "f" and not np.all(np.isfinite(array)):
         raise ValueError(f"{what} contains NaN or infinity")
     start = np.asarray(spec.start).reshape(spec.shape) if spec.start else 0
@@ -174,4 +197,3 @@ def load(path: str | Path, learner: Learner | None = None, checkpoint: str = "la
     loaded = load_tree(folder / "policy.safetensors", shapes)
     about = {k: v for k, v in data.items() if k not in ("observation", "action")}
     return LoadedPolicy(loaded, spec, json.loads(json.dumps(about)))
-

@@ -56,8 +56,8 @@ class RunState(eqx.Module):
     """What a checkpoint holds: the algorithm's state, the sums of the unfinished row, and the best evaluation so far."""
 
     algorithm: State
-    sums: jax.Array
-    best: jax.Array
+    sums: State
+    best: State
 
 
 class StopSignal:
@@ -103,7 +103,15 @@ class Limits:
 class Session:
     """One execution of a plan in its folders, one folder a seed. Its methods are what happens between two chunks."""
 
-    def __init__(self, plan: Plan, folders: Sequence[RunFolder], seeds: Sequence[int], limits: Limits, sinks: Sequence[str], quiet: bool):
+    def __init__(
+        self,
+        plan: Plan,
+        folders: Sequence[RunFolder],
+        seeds: Sequence[int],
+        limits: Limits,
+        sinks: Sequence[str],
+        quiet: bool,
+    ):
         self.plan, self.folders, self.seeds, self.limits = plan, list(folders), list(seeds), limits
         self.batched = len(seeds) > 1
         keys = [jax.random.key(seed) for seed in seeds]
@@ -111,7 +119,9 @@ class Session:
         self.program = Program(plan.algorithm, self.key, plan.config["row_every"])
         episodes = plan.config["eval_episodes"]
         self.evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, episodes, self.batched)
-        self.sinks: list[list[Sink]] = [[CSV(f), *(SINKS[name](f, plan.config) for name in sinks)] for f in self.folders]
+        self.sinks: list[list[Sink]] = [
+            [CSV(f), *(SINKS[name](f, plan.config) for name in sinks)] for f in self.folders
+        ]
         self.reporter_quiet = quiet
         self.best = np.full(len(seeds), -np.inf)
         self.seconds_before, self.last_checkpoint = 0.0, time.monotonic()
@@ -159,8 +169,11 @@ class Session:
 
     def checkpoint(self, moment: Moment) -> None:
         """Write the whole state of every seed."""
-        states = RunState(moment.state, jnp.moveaxis(moment.sums, -1, 0) if self.batched else moment.sums,
-                          jnp.asarray(self.best if self.batched else self.best[0], jnp.float32))
+        states = RunState(
+            moment.state,
+            jnp.moveaxis(moment.sums, -1, 0) if self.batched else moment.sums,
+            jnp.asarray(self.best if self.batched else self.best[0], jnp.float32),
+        )
         about = {"env_steps": moment.env_steps, "seconds": self.seconds_before + moment.seconds}
         for folder, state in zip(self.folders, self._each(states), strict=True):
             folder.save_checkpoint(moment.iteration, state, about)
@@ -181,7 +194,9 @@ class Session:
 
     # --- the whole -------------------------------------------------------------------------------------------------------------
 
-    def execute(self, resume_from: tuple[State, jax.Array, int] | None, callbacks: Sequence[Callback | Every]) -> list[Run]:
+    def execute(
+        self, resume_from: tuple[State, jax.Array, int] | None, callbacks: Sequence[Callback | Every]
+    ) -> list[Run]:
         """Train to the end of the budget or to the first reason to stop."""
         start = 0 if resume_from is None else resume_from[2]
         steps = steps_after(self.plan.algorithm, start)
@@ -201,13 +216,22 @@ class Session:
         try:
             with asked:
                 every = Every(self.plan.config["eval_every"], self.evaluate)
-                run(self.plan.algorithm, self.key, self.plan.iterations, callbacks=[every, *callbacks, between],
-                    row_every=self.plan.config["row_every"], resume_from=resume_from, program=self.program)
+                run(
+                    self.plan.algorithm,
+                    self.key,
+                    self.plan.iterations,
+                    callbacks=[every, *callbacks, between],
+                    row_every=self.plan.config["row_every"],
+                    resume_from=resume_from,
+                    program=self.program,
+                )
                 moment = last[0]
                 if moment.iteration not in self.folders[0].iterations():
                     self.checkpoint(moment)
                 if asked.raised:
-                    raise Interrupted(f"interrupted after {moment.env_steps} steps; a checkpoint is written: rtg resume {self.folders[0].path}")
+                    raise Interrupted(
+                        f"interrupted after {moment.env_steps} steps; a checkpoint is written: rtg resume {self.folders[0].path}"
+                    )
                 reporter.close()
                 return self._finish(moment, reporter)
         finally:
@@ -229,20 +253,28 @@ class Session:
             explore = self.evaluator(self._policy(moment.state, True), key)
             for k in range(len(self.seeds)):
                 pick = lambda found, k=k: [x[k] if self.batched else x for x in found]  # noqa: E731
-                results[k] = {"env_steps": moment.env_steps, **summary(*pick(greedy)), "stochastic": summary(*pick(explore))}
+                results[k] = {
+                    "env_steps": moment.env_steps,
+                    **summary(*pick(greedy)),
+                    "stochastic": summary(*pick(explore)),
+                }
         for k, folder in enumerate(self.folders):
             if results[k] is not None:
                 write_json(folder.path / "evaluation.json", results[k])
             draw_curves([folder.path], folder.path / "curve.png")
             runs.append(Run(folder.path, results[k]))
         rate = (moment.env_steps - steps_after(self.plan.algorithm, 0)) / max(moment.seconds, 1e-9)
-        reporter.say(f"{moment.env_steps:,} steps in {self.seconds_before + moment.seconds:.1f} s ({rate:,.0f} steps/s) after compiling for "
-                     f"{moment.compile_seconds:.1f} s")
+        reporter.say(
+            f"{moment.env_steps:,} steps in {self.seconds_before + moment.seconds:.1f} s ({rate:,.0f} steps/s) after compiling for "
+            f"{moment.compile_seconds:.1f} s"
+        )
         for r in runs:
             if r.evaluation is not None:
                 low, high = r.evaluation["return_ci95"]
-                reporter.say(f"return {r.evaluation['return_mean']:.1f} [{low:.1f}, {high:.1f}] over {r.evaluation['episodes']} episodes "
-                             f"(sampling actions: {r.evaluation['stochastic']['return_mean']:.1f})")
+                reporter.say(
+                    f"return {r.evaluation['return_mean']:.1f} [{low:.1f}, {high:.1f}] over {r.evaluation['episodes']} episodes "
+                    f"(sampling actions: {r.evaluation['stochastic']['return_mean']:.1f})"
+                )
             reporter.say(f"run folder {r.path}   learning curve {r.path / 'curve.png'}")
         return runs
 
@@ -289,11 +321,24 @@ def train(
     if unknown:
         raise ValueError(f"there is no sink {unknown[0]!r}: choose from {', '.join(SINKS)}")
     make_plan = lambda seed: plan(  # noqa: E731
-        algorithm, env, steps=steps, seed=seed, num_envs=num_envs, backend=backend, learner=learner, loop=loop,
-        env_kwargs=env_kwargs, preset=preset, data=data)
+        algorithm,
+        env,
+        steps=steps,
+        seed=seed,
+        num_envs=num_envs,
+        backend=backend,
+        learner=learner,
+        loop=loop,
+        env_kwargs=env_kwargs,
+        preset=preset,
+        data=data,
+    )
     seeds = [seed + k for k in range(num_seeds)]
     first = make_plan(seed)
-    folders = [RunFolder(p) for p in new_folders(None if out is None else str(out), first.name, first.config["env"]["id"], seeds)]
+    folders = [
+        RunFolder(p)
+        for p in new_folders(None if out is None else str(out), first.name, first.config["env"]["id"], seeds)
+    ]
     together = num_seeds > 1 and not hosted(first.algorithm)
     groups = [range(num_seeds)] if together else [[k] for k in range(num_seeds)]
     for k, folder in enumerate(folders):
@@ -357,7 +402,11 @@ def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: 
     like = RunState(shapes, sums, jax.ShapeDtypeStruct(program.key.shape, jnp.float32))
     if session.batched:
         sums = jax.ShapeDtypeStruct(sums.shape[:-1], sums.dtype)
-        like = RunState(jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes), sums, jax.ShapeDtypeStruct((), jnp.float32))
+        like = RunState(
+            jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes),
+            sums,
+            jax.ShapeDtypeStruct((), jnp.float32),
+        )
     loaded = [folder.load_checkpoint(start, like) for folder in folders]
     session.seconds_before = max(about.get("seconds", 0.0) for _, about in loaded)
     states = [state for state, _ in loaded]
@@ -367,7 +416,12 @@ def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: 
     if hosted(part.algorithm):
         print("the environment keeps its own state, which no checkpoint holds: new episodes begin", file=sys.stderr)
         fresh = program.init()
-        state = jax.tree.map(lambda new, old: new if isinstance(new, Actor) else old, fresh, state, is_leaf=lambda x: isinstance(x, Actor))
+        state = jax.tree.map(
+            lambda new, old: new if isinstance(new, Actor) else old,
+            fresh,
+            state,
+            is_leaf=lambda x: isinstance(x, Actor),
+        )
     return state, jnp.moveaxis(whole.sums, 0, -1) if session.batched else whole.sums, start
 
 

@@ -21,8 +21,35 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from ..core import Action, Batch, Carry, EnvSpec, Learner, Number, Observation, Policy, PRNGKey, Transition, number, part, require_action, setting, value_at
-from ..nn import MLP, Linear, Network, RunningNorm, Torso, action_mask, as_network, is_recurrent, unroll
+from ..core import (
+    Action,
+    Batch,
+    Carry,
+    EnvSpec,
+    Learner,
+    Number,
+    Observation,
+    Policy,
+    PRNGKey,
+    Transition,
+    number,
+    part,
+    require_action,
+    setting,
+)
+from ..nn import (
+    MLP,
+    Adam,
+    Linear,
+    Network,
+    RunningNorm,
+    Torso,
+    action_mask,
+    as_network,
+    global_norm,
+    is_recurrent,
+    unroll,
+)
 from ..ops.schedules import Linear as LinearSchedule
 from ..ops.td import double_q_target, huber, q_target
 
@@ -54,7 +81,8 @@ class QNetwork(eqx.Module):
 
     def along(self, t: Transition) -> tuple[Float[Array, "*N A"], Float[Array, "*N A"]]:
         """Q at every observation and every `next_observation`: of transitions `[N]`, or with a memory of sequences `[T, N]`,
-        each from the memory that was stored with its first step."""
+        each from the memory that was stored with its first step.
+        """
         if not is_recurrent(self.torso):
             read = jax.vmap(lambda o: self((), o)[1])
             return read(t.observation), read(t.next_observation)
@@ -112,8 +140,12 @@ class DQN(Learner):
     network: Network = part(MLP(64, 64, activation="relu"), "recipe of the Q network", converter=as_network)
     learning_rate: Number = number(1e-3, "Adam's step size", above=0)
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
-    epsilon: Number = number(LinearSchedule(1.0, 0.05, fraction=0.2), "probability of a random action while learning", at_least=0, at_most=1)
-    target_rate: Number = number(1.0, "tau: how far the target moves towards the network; 1 copies it", above=0, at_most=1)
+    epsilon: Number = number(
+        LinearSchedule(1.0, 0.05, fraction=0.2), "probability of a random action while learning", at_least=0, at_most=1
+    )
+    target_rate: Number = number(
+        1.0, "tau: how far the target moves towards the network; 1 copies it", above=0, at_most=1
+    )
     target_period: int = setting(250, "updates between two moves of the target", at_least=1)
     double: bool = setting(False, "let the online network choose the action that the target network values")
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
@@ -132,45 +164,58 @@ class DQN(Learner):
         require_action("DQN", spec, self.action_kinds)
         network = QNetwork.of(self.network, spec, key)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
-        zero = jnp.zeros((), jnp.int32)
-        return DQNState(network, network, self._optimiser(zero).init(network), norm, zero)
+        optimiser = self._optimiser().init(network)
+        return DQNState(network, network, optimiser, norm, jnp.zeros((), jnp.int32))
 
     def policy(self, state: DQNState, explore: bool) -> GreedyPolicy:
-        epsilon = value_at(self.epsilon, state.updates) if explore else 0.0
+        epsilon = self.at(state.updates).epsilon if explore else 0.0
         return GreedyPolicy(state.network, state.norm, jnp.asarray(epsilon, jnp.float32))
 
-    def update(self, state: DQNState, batch: Batch, key: PRNGKey) -> tuple[DQNState, dict[str, Array], Float[Array, "N"]]:
+    def update(
+        self, state: DQNState, batch: Batch, key: PRNGKey
+    ) -> tuple[DQNState, dict[str, Array], Float[Array, "N"]]:
         del key
-        t = batch.transitions
+        now, t = self.at(state.updates), batch.transitions
         norm = None if state.norm is None else state.norm.update(t.observation)
         if norm is not None:
             standard = jax.vmap(norm) if self.batch == "transitions" else jax.vmap(jax.vmap(norm))
-            t = eqx.tree_at(lambda t: (t.observation, t.next_observation), t, (standard(t.observation), standard(t.next_observation)))
+            t = eqx.tree_at(
+                lambda t: (t.observation, t.next_observation),
+                t,
+                (standard(t.observation), standard(t.next_observation)),
+            )
 
         def loss(network: QNetwork) -> tuple[Array, tuple[Array, Array]]:
             q, following = network.along(t)
             _, target_following = state.target.along(t)
-            discount = value_at(self.gamma, state.updates) * (1.0 - t.terminated)
+            discount = now.gamma * (1.0 - t.terminated)
             # Where plain Q-learning has no use for the online values, the compiler drops their computation.
-            value_of = (lambda *a: double_q_target(*a)) if self.double else (lambda r, d, target, _: q_target(r, d, target))
+            value_of = (
+                (lambda *a: double_q_target(*a)) if self.double else (lambda r, d, target, _: q_target(r, d, target))
+            )
             for _ in range(t.reward.ndim):
                 value_of = jax.vmap(value_of)
             y = jax.lax.stop_gradient(value_of(t.reward, discount, target_following, following))
             chosen = jnp.take_along_axis(q, t.action[..., None], -1)[..., 0]
             error = chosen - y
-            return (batch.weights * huber(error, self.huber)).mean(), (chosen, error)
+            return (batch.weights * huber(error, now.huber)).mean(), (chosen, error)
 
         (value, (chosen, error)), gradient = jax.value_and_grad(loss, has_aux=True)(state.network)
-        step, optimiser = self._optimiser(state.updates).update(gradient, state.optimiser)
-        network = optax.apply_updates(state.network, step)
+        network, optimiser = now._optimiser().step(state.network, gradient, state.optimiser)
         updates = state.updates + 1
-        tau = jnp.where(updates % self.target_period == 0, value_at(self.target_rate, state.updates), 0.0)
-        target = jax.tree.map(lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), state.target, network)
-        metrics = {"q_loss": value, "q_mean": chosen.mean(), "td_error": jnp.abs(error).mean(), "grad_norm": optax.global_norm(gradient),
-                   "epsilon": value_at(self.epsilon, state.updates)}
+        tau = jnp.where(updates % self.target_period == 0, now.target_rate, 0.0)
+        target = jax.tree.map(
+            lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), state.target, network
+        )
+        metrics = {
+            "q_loss": value,
+            "q_mean": chosen.mean(),
+            "td_error": jnp.abs(error).mean(),
+            "grad_norm": global_norm(gradient),
+            "epsilon": now.epsilon,
+        }
         priorities = jnp.abs(error) if error.ndim == 1 else jnp.abs(error).mean(0)
         return DQNState(network, target, optimiser, norm, updates), metrics, priorities
 
-    def _optimiser(self, updates: Array) -> optax.GradientTransformation:
-        rate = value_at(self.learning_rate, updates)
-        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(rate))
+    def _optimiser(self) -> Adam:
+        return Adam(self.learning_rate, self.max_grad_norm)

@@ -1,0 +1,3 @@
+"""Chapter 2: imitation learning."""
+
+from .bc import BC as BC

@@ -1,0 +1,38 @@
+"""Gradient descent as every learner here does it: Adam on a gradient whose global norm is bounded."""
+
+from typing import TypeVar, cast
+
+import equinox as eqx
+import optax
+from jaxtyping import Array, Float
+
+from ..core import Number
+
+Parameters = TypeVar("Parameters")
+
+
+class Adam(eqx.Module):
+    """Adam (Kingma and Ba 2015) after clipping by the global norm. Its numbers may be traced: building it in each update is free."""
+
+    rate: Number
+    max_grad_norm: Number
+    eps: float = 1e-8
+
+    def init(self, parameters: Parameters) -> optax.OptState:
+        """The state before the first step; it does not depend on the numbers."""
+        return Adam(0.0, 1.0)._transformation().init(cast(optax.Params, parameters))
+
+    def _transformation(self) -> optax.GradientTransformation:
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(self.rate, eps=self.eps))
+
+    def step(
+        self, parameters: Parameters, gradient: Parameters, state: optax.OptState
+    ) -> tuple[Parameters, optax.OptState]:
+        """One step down the gradient."""
+        change, state = self._transformation().update(cast(optax.Updates, gradient), state)
+        return cast(Parameters, optax.apply_updates(cast(optax.Params, parameters), change)), state
+
+
+def global_norm(tree: Parameters) -> Float[Array, ""]:
+    """Euclidean norm of all the numbers in a tree."""
+    return cast(Array, optax.global_norm(cast(optax.Params, tree)))
