@@ -8,13 +8,16 @@ import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
+
+
+Module = TypeVar("Module")
 
 
 class Schedule(eqx.Module):
@@ -140,7 +143,7 @@ class Configured(eqx.Module):
     Raises `ValueError` naming the field, the value and the range. Traced values cannot be looked at and are not checked.
     """
 
-    def at(self, step: Array | int) -> Self:
+    def at(self: Module, step: Array | int) -> Module:
         """The same module with every schedule replaced by its value after `step` updates."""
         is_schedule = lambda leaf: isinstance(leaf, Schedule)  # noqa: E731
         return jax.tree.map(lambda x: x(step) if is_schedule(x) else x, self, is_leaf=is_schedule)

@@ -78,8 +78,10 @@ class Spec:
         if self.kind == "multi_binary":
             return jax.random.bernoulli(key, 0.5, self.shape).astype(self.dtype)
         low, high = self.bounds()
-        if self.dtype == "uint8":
-            return jax.random.randint(key, self.shape, low.astype(int), high.astype(int) + 1).astype(jnp.uint8)
+        if np.issubdtype(np.dtype(self.dtype), np.integer):
+            least, most = np.iinfo(np.int32).min, np.iinfo(np.int32).max
+            low, high = np.clip(np.float64(low), least, most), np.clip(np.float64(high) + 1, least, most)
+            return jax.random.randint(key, self.shape, low.astype(np.int32), high.astype(np.int32)).astype(self.dtype)
         below, above = np.isfinite(low), np.isfinite(high)
         if np.all(below & above):
             return jax.random.uniform(key, self.shape, minval=jnp.asarray(low), maxval=jnp.asarray(high))
