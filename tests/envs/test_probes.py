@@ -1,5 +1,6 @@
 """The values that probes claim, against their own transitions; and that the mistakes they are made for do show."""
 
+import functools
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -28,6 +29,7 @@ EVERY = [*PASSIVE, *CHOOSING, probes.QuadraticReward(), probes.RecallProbe(), pr
 name = lambda probe: repr(probe).replace(" ", "")  # noqa: E731
 
 
+@functools.cache
 def roll(probe, length=40, size=4):
     """Observations before each of `length` random actions in `size` copies, those actions, and the timesteps; flat."""
     env = vectorize(probe, size)

@@ -162,7 +162,9 @@ def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
     if meta["traced"]:
         if isinstance(value, Schedule):
             values, span = value.extremes(), span.closed()
-        elif isinstance(value, float) or (hasattr(value, "dtype") and np.issubdtype(value.dtype, np.number)):
+        elif isinstance(value, float) or (
+            isinstance(value, (jax.Array, np.ndarray, np.generic)) and np.issubdtype(value.dtype, np.number)
+        ):
             values = tuple(np.asarray(value, np.float64).ravel())
         else:
             raise ValueError(f"{owner}.{field.name} must be a number in {span} or a schedule, not {value!r}")

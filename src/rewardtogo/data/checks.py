@@ -103,7 +103,7 @@ def _where(wrong: np.ndarray, done: np.ndarray) -> str:
 def _finite(tree: Any, what: str, where: Any) -> None:
     for leaf in jax.tree.leaves(tree):
         if leaf.dtype.kind == "f":
-            wrong = ~np.isfinite(leaf).reshape(len(leaf), -1).all(1)
+            wrong = ~np.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim)))
             if wrong.any():
                 raise ValueError(f"the {what} of {where(wrong)} is NaN or infinite: leave that episode out")
 
@@ -119,7 +119,7 @@ def _within(spec: Spec, action: np.ndarray, where: Any) -> None:
         raise ValueError(
             "actions that are dictionaries cannot be recorded: use an environment with a plain action space"
         )
-    wrong = ((action < low) | (action > high)).reshape(len(action), -1).any(1)
+    wrong = ((action < low) | (action > high)).any(axis=tuple(range(1, action.ndim)))
     if wrong.any():
         raise ValueError(
             f"the action of {where(wrong)} is {action[np.argmax(wrong)]}, which is outside the action space "
@@ -139,7 +139,7 @@ def _allowed(observation: Any, action: np.ndarray, where: Any) -> None:
 
 def _consecutive(observation: Any, following: Any, done: np.ndarray, where: Any) -> None:
     for now, after in zip(jax.tree.leaves(observation), jax.tree.leaves(following), strict=True):
-        wrong = np.append((now[1:] != after[:-1]).reshape(len(now) - 1, -1).any(1) & ~done[:-1], False)
+        wrong = np.append((now[1:] != after[:-1]).any(axis=tuple(range(1, now.ndim))) & ~done[:-1], False)
         if wrong.any():
             raise ValueError(
                 f"the next observation of {where(wrong)} is not the observation of the step after it: "

@@ -8,6 +8,7 @@ definition, so that one whose last step has no flag counts as truncated.
 import inspect
 import json
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -88,14 +89,17 @@ def to_minari(
     if "jpeg_encoding" in inspect.signature(create).parameters:
         options["jpeg_encoding"] = False  # JPEG would change the pictures
     try:
-        create(
-            dataset_id,
-            buffers,
-            observation_space=observation.to_space(),
-            action_space=action.to_space(),
-            data_format="hdf5",
-            **options,
-        )
+        with warnings.catch_warnings():
+            # Minari warns of every optional description that is left out.
+            warnings.simplefilter("ignore", UserWarning)
+            create(
+                dataset_id,
+                buffers,
+                observation_space=observation.to_space(),
+                action_space=action.to_space(),
+                data_format="hdf5",
+                **options,
+            )
     except (OSError, ImportError) as error:
         raise ValueError(f"Minari cannot write {dataset_id}: {error}") from error
     return _folder(dataset_id).parent

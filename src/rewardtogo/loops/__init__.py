@@ -3,5 +3,6 @@
 from .collect import RandomPolicy as RandomPolicy
 from .collect import begin as begin
 from .collect import collect as collect
+from .devices import shard as shard
 from .off_policy import OffPolicy as OffPolicy
 from .on_policy import OnPolicy as OnPolicy

@@ -19,6 +19,7 @@ from ..core import (
     VectorEnv,
     env_spec,
 )
+from .devices import shard
 
 
 class RandomPolicy(Policy):
@@ -74,7 +75,7 @@ def collect(
     too, as `extras["carry"]`. Memories are reset where an episode ends; actions are clipped into the action space on their way
     to the environment and stored as the policy sampled them.
     """
-    action_spec = env_spec(env).action
+    action_spec, actor = env_spec(env).action, shard(actor)
     num_envs, first_carry = env.num_envs, actor.carry
     carry_key, act_key, env_key = jax.random.split(key, 3)
     # Keys are split before the loop: splitting inside costs a hash a step.
@@ -108,4 +109,4 @@ def collect(
         return (actor, episodes), transition
 
     (actor, episodes), transitions = jax.lax.scan(step, (actor, Episodes.none()), (act_keys, env_keys))
-    return actor, Rollout(transitions, first_carry), episodes
+    return shard(actor), Rollout(shard(transitions, axis=1), first_carry), episodes

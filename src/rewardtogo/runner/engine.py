@@ -136,7 +136,7 @@ class Program:
     def advance(self, state: State, sums: Array, start: int, stop: int) -> tuple[State, Array, np.ndarray]:
         """Iterations `start` to `stop` (at most `ROWS_PER_CHUNK` rows): new state, sums of the unfinished row, table of finished rows."""
         leaves, structure = jax.tree.flatten(state)
-        large = [leaf.nbytes >= LARGE if hasattr(leaf, "nbytes") else False for leaf in leaves]
+        large = [leaf.nbytes >= LARGE for leaf in leaves]
         big = [x for x, heavy in zip(leaves, large, strict=True) if heavy]
         small = [x for x, heavy in zip(leaves, large, strict=True) if not heavy]
         if self._advance is None:

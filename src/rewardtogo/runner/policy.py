@@ -105,6 +105,10 @@ class LoadedPolicy:
         action = jax.device_get(jax.vmap(self.spec.action.clip)(action))
         return self._outward(action if batched else jax.tree.map(lambda x: x[0], action), batched)
 
+    def policy(self, explore: bool = False) -> Policy:
+        """The policy as loops and evaluations take it: one observation in the library's own form, without clipping."""
+        return self._policies["explore" if explore else "greedy"]
+
     def inspect(self, observation: Any) -> dict[str, np.ndarray]:
         """What it thinks of an observation: `value`, `q_values`, `probabilities`, `mean`, `std`, whichever it has."""
         observation, batched = self._inward(observation)

@@ -1,0 +1,28 @@
+"""Figures and experiments of the notes, one file each, drawn anew from computed numbers."""
+
+import importlib
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from ..catalogue import nearest
+
+FIGURES = {
+    "1.1": ("markov_chain", "a Markov chain, its simulation, and where its state distribution goes"),
+    "1.2": ("anatomy", "the anatomy of reinforcement learning: the three parts of the loop, and the time each takes"),
+}
+"""Number in the notes: the module here that draws it, and what it shows."""
+
+
+def draw(name: str, out: str | None = None, seed: int = 0) -> Path:
+    """Draw a figure into a file (`figure-NAME.png` if not said). Raises `ValueError` for a figure that there is not."""
+    if name not in FIGURES:
+        raise ValueError(f"there is no figure {name!r}: {nearest(name, FIGURES)}")
+    path = Path(out or f"figure-{name}.png")
+    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise ValueError(f"a figure is written as .png, .svg or .pdf, not {path.suffix or 'without an ending'!r}")
+    module = importlib.import_module(f"{__name__}.{FIGURES[name][0]}")
+    figure = module.draw(seed)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=150)
+    return path

@@ -1,0 +1,195 @@
+"""Watching a policy: one episode in Gymnasium's own environment, which can draw, as a GIF or an MP4.
+
+The compiled twins have no pictures; they are the same environments, so their policies are shown in the originals.
+"""
+
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from PIL import Image
+
+from ..catalogue import ENVIRONMENTS
+from ..core import MASK, Learner
+from .evaluate import MAX_STEPS
+from .folder import RunFolder
+from .policy import LoadedPolicy, load
+
+ENDINGS = (".gif", ".mp4")
+MASKED = {"CartPoleNoVel-v1": ("CartPole-v1", (0, 2)), "PendulumNoVel-v1": ("Pendulum-v1", (0, 1))}
+"""Environments of ours that hide entries of one of Gymnasium's: which one, and the entries that are seen."""
+MOST_FRAMES = 3000
+"""Frames after which a film ends; the episode goes on without being drawn."""
+FASTEST = 50
+"""Frames a second beyond which programs that show GIFs slow them down; a faster environment is shown in every other frame."""
+
+
+def play(
+    run: str | Path,
+    out: str | Path | None = None,
+    seed: int = 0,
+    checkpoint: str = "last",
+    stochastic: bool = False,
+    *,
+    env: gymnasium.Env | Callable[..., gymnasium.Env] | None = None,
+    learner: Learner | None = None,
+) -> tuple[Path, float, int]:
+    """Draw one episode into a film; returns its file, the episode's return and its length.
+
+    - `out`: a `.gif` or `.mp4` (extra `video`); by default `episode.gif` in the run's folder.
+    - `env`: for a run made with an environment object: one with `render_mode="rgb_array"`, or what makes it with that argument.
+    - `learner`: needed for a run of a learner that is not part of the library.
+
+    Raises `ValueError`, one sentence, where there is no picture to draw or a package is missing.
+    """
+    folder = RunFolder(run)
+    config = folder.config()
+    path = Path(out) if out is not None else folder.path / "episode.gif"
+    if path.suffix.lower() not in ENDINGS:
+        raise ValueError(f"a film is written to a file ending in {' or '.join(ENDINGS)}, not to {path}")
+    policy = load(folder.path, learner, checkpoint)
+    drawn = _drawable(config["env"], env)
+    try:
+        with _Film(path, float(drawn.metadata.get("render_fps") or 30)) as film:
+            total, length = _episode(drawn, policy, seed, stochastic, film)
+    finally:
+        if drawn is not env:
+            drawn.close()
+    return path, total, length
+
+
+def _drawable(described: dict[str, Any], env: Any) -> gymnasium.Env:
+    """Gymnasium's environment, ready to be drawn."""
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    if isinstance(env, gymnasium.Env):
+        return env
+    name = described["id"]
+    if env is None and not described["by_name"]:
+        raise ValueError(
+            f"the run was made with an environment object ({name}), which a file cannot hold: "
+            "give it from Python with play(run, env=...)"
+        )
+    base, keep = MASKED.get(name, (name, None))
+    if env is None and ":" not in base and base not in gymnasium.registry:
+        what = "is one of the compiled environments without a picture" if name in ENVIRONMENTS else "is no environment"
+        raise ValueError(f"{name} {what}: play shows runs in Gymnasium's environments")
+    make = env if env is not None else lambda **kwargs: gymnasium.make(base, disable_env_checker=True, **kwargs)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a mode that the environment does not have, which is said below
+            made = make(render_mode="rgb_array", **described["kwargs"])
+    except (gymnasium.error.Error, ImportError, TypeError) as error:
+        raise _no_picture(name, error) from error
+    return made if keep is None else _masked(made, keep)
+
+
+def _masked(env: gymnasium.Env, keep: tuple[int, ...]) -> gymnasium.Env:
+    space: Any = env.observation_space
+    entries = list(keep)
+    seen = gymnasium.spaces.Box(space.low[entries], space.high[entries], dtype=np.float32)
+    return gymnasium.wrappers.TransformObservation(env, lambda observation: observation[entries], seen)
+
+
+def _no_picture(name: str, error: BaseException | None) -> ValueError:
+    """Why `name` cannot be drawn, and which extra would help."""
+    said = "" if error is None else " ".join(str(error).split())
+    for word, extra in (("pygame", "render"), ("box2d", "box2d"), ("mujoco", "mujoco")):
+        if word in said.lower():
+            return ValueError(f"{name} is drawn with {word}, which is not installed: pip install 'rewardtogo[{extra}]'")
+    return ValueError(f"{name} has no picture of the kind rgb_array{f' ({said})' if said else ''}: it cannot be shown")
+
+
+def _frame(env: gymnasium.Env, name: str) -> np.ndarray:
+    try:
+        picture: Any = env.render()
+    except (gymnasium.error.Error, ImportError, NotImplementedError) as error:
+        raise _no_picture(name, error) from error
+    picture = picture[-1] if isinstance(picture, list) and picture else picture
+    if not isinstance(picture, np.ndarray) or picture.ndim != 3:
+        raise _no_picture(name, None)
+    return picture.astype(np.uint8)
+
+
+def _episode(
+    env: gymnasium.Env, policy: LoadedPolicy, seed: int, stochastic: bool, film: "_Film"
+) -> tuple[float, int]:
+    name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+    policy.reset(seed)
+    observation, info = env.reset(seed=seed)
+    total, length, over = 0.0, 0, False
+    film.add(lambda: _frame(env, name))
+    while not over:
+        if length >= MAX_STEPS:
+            raise ValueError(f"the episode of {name} did not end within {MAX_STEPS} steps: give it a time limit")
+        action = policy(_with_mask(observation, info, policy), deterministic=not stochastic)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, length, over = total + float(reward), length + 1, bool(terminated or truncated)
+        film.add(lambda: _frame(env, name))
+    return total, length
+
+
+def _with_mask(observation: Any, info: dict[str, Any], policy: LoadedPolicy) -> Any:
+    """The observation with the mask of allowed actions from `info`, where the policy learnt with it."""
+    names = [name for name, _ in policy.spec.observation.parts]
+    if MASK not in names or MASK not in info or (isinstance(observation, dict) and MASK in observation):
+        return observation
+    if isinstance(observation, tuple):
+        observation = {str(i): part for i, part in enumerate(observation)}
+    return {**(observation if isinstance(observation, dict) else {"observation": observation}), MASK: info[MASK]}
+
+
+class _Film:
+    """Frames on their way to a file: a GIF by Pillow, or an MP4 by imageio's ffmpeg."""
+
+    def __init__(self, path: Path, fps: float):
+        self.path, self.skip = path, max(1, round(fps / FASTEST))
+        self.fps, self.seen = fps / self.skip, 0
+        self.frames: list[Image.Image] = []
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._writer = _mp4(path, self.fps) if path.suffix.lower() == ".mp4" else None
+
+    def add(self, draw: Callable[[], np.ndarray]) -> None:
+        """Take the next frame, unless it is one too many."""
+        self.seen += 1
+        if (self.seen - 1) % self.skip or (self.seen - 1) // self.skip >= MOST_FRAMES:
+            return
+        picture = draw()
+        if self._writer is not None:
+            with warnings.catch_warnings():
+                # JAX warns of the fork that starts ffmpeg; what is forked becomes ffmpeg at once and never uses JAX.
+                warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+                self._writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
+        else:
+            # As a palette picture at once: a film of full colours would fill the memory.
+            self.frames.append(Image.fromarray(picture).quantize(256, Image.Quantize.FASTOCTREE))
+
+    def __enter__(self) -> "_Film":
+        return self
+
+    def __exit__(self, failed: type[BaseException] | None, *more: object) -> None:
+        """Write what was taken; nothing where the episode failed."""
+        if self._writer is not None:
+            self._writer.close()
+            if failed is not None:
+                self.path.unlink(missing_ok=True)
+        elif failed is None:
+            first, *others = self.frames
+            duration = max(1000 // FASTEST, round(1000 / self.fps, -1))
+            first.save(self.path, save_all=True, append_images=others, duration=duration, loop=0)
+
+
+def _mp4(path: Path, fps: float) -> Any:
+    try:
+        importlib.import_module("imageio_ffmpeg")
+        imageio = importlib.import_module("imageio.v2")
+    except ImportError as error:
+        raise ValueError(f"writing {path} needs imageio and ffmpeg: pip install 'rewardtogo[video]'") from error
+    return imageio.get_writer(path, format="FFMPEG", fps=fps, macro_block_size=2)
