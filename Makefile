@@ -24,7 +24,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m "not slow" -n 2 -q
 
 slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m slow -q
+	$(BIN)/python tests/coverage_report.py --slow
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check $(CHECKED)

@@ -8,19 +8,12 @@ from typing import Any
 Preset = dict[str, Any]
 
 PRESETS: dict[tuple[str, str], Preset] = {
-    # Found here, starting from RL Zoo's settings (8 x 32, 20 epochs): longer rollouts make all seeds reach 500 within 100k steps.
+    # 20 of 20 seeds reach a return of 500 within 100k steps.
     ("ppo", "CartPole-v1"): {
         "steps": 100_000,
         "num_envs": 8,
-        "loop": {"unroll": 32},
-        "learner": {
-            "learning_rate": "linear:1e-3:0",
-            "clip": "linear:0.2:0",
-            "gamma": 0.98,
-            "gae_lambda": 0.8,
-            "epochs": 20,
-            "minibatches": 1,
-        },
+        "loop": {"unroll": 128},
+        "learner": {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_grad_norm": 5.0},
     },
 }
 """Keys are the algorithm's name and the environment's id."""

@@ -66,11 +66,10 @@ class Tally(Learner):
 
 @pytest.fixture(params=["transitions", "sequences"])
 def algorithm(request) -> Offline:
-    return Offline(counting(), Tally(wants=request.param), batch_size=7, updates=3, length=5)
+    return Offline(counting(), Tally(wants=request.param), batch_size=7, updates=3, length=5).with_horizon(4)
 
 
 def test_counts(algorithm, key):
-    algorithm = algorithm.with_horizon(4)
     assert (algorithm.steps_per_iteration, algorithm.initial_steps, Offline.default_num_envs()) == (3, 0, 1)
     state, (metrics, episodes) = jax.jit(lambda a, k: a.step(a.init(k), k))(algorithm, key)
     assert float(episodes.count) == 0.0
@@ -93,7 +92,7 @@ def test_draws_are_uniform(algorithm, key):
 
 
 def test_windows_are_consecutive_and_wrap(key):
-    algorithm = Offline(counting(), Tally(wants="sequences"), batch_size=200, length=12)
+    algorithm = Offline(counting(), Tally(wants="sequences"), batch_size=200, length=12).with_horizon(100)
     t = algorithm._sample(algorithm.learner.init(SPEC, key), key).transitions
     place = np.asarray(t.reward, int)
     assert place.shape == (12, 200) and t.observation.shape == (12, 200, 1)
@@ -103,7 +102,7 @@ def test_windows_are_consecutive_and_wrap(key):
 
 
 def test_sequences_begin_with_a_fresh_memory(key):
-    algorithm = Offline(counting(), DQN(network=GRU(4, MLP(3))), batch_size=6, length=5)
+    algorithm = Offline(counting(), DQN(network=GRU(4, MLP(3))), batch_size=6, length=5).with_horizon(100)
     state = algorithm.init(key)
     batch = algorithm._sample(state.learner, key)
     carry = batch.transitions.extras["carry"]
@@ -114,14 +113,14 @@ def test_sequences_begin_with_a_fresh_memory(key):
 
 
 def test_the_data_is_an_argument_of_the_program(key):
-    algorithm = Offline(counting(), DQN(network=MLP(4)), batch_size=4, updates=2)
+    algorithm = Offline(counting(), DQN(network=MLP(4)), batch_size=4, updates=2).with_horizon(100)
     state = algorithm.init(key)
     program = jax.make_jaxpr(lambda a, s, k: a.step(s, k))(algorithm, state, key)
     assert not [c for c in program.consts if np.size(c) >= algorithm.dataset.num_steps]
 
 
 def test_seeds_share_the_data(key):
-    algorithm = Offline(counting(), DQN(network=MLP(4)), batch_size=4, updates=2)
+    algorithm = Offline(counting(), DQN(network=MLP(4)), batch_size=4, updates=2).with_horizon(100)
     keys = jax.random.split(key, 3)
     states = jax.vmap(lambda a, k: a.init(k), in_axes=(None, 0))(algorithm, keys)
     _, (metrics, _) = jax.jit(jax.vmap(lambda a, s, k: a.step(s, k), in_axes=(None, 0, 0)))(algorithm, states, keys)
@@ -129,12 +128,12 @@ def test_seeds_share_the_data(key):
 
 
 def test_every_leaf_of_the_state_is_an_array(key):
-    state = Offline(counting(), DQN(network=MLP(4))).init(key)
+    state = Offline(counting(), DQN(network=MLP(4))).with_horizon(100).init(key)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(state))
 
 
 def test_more_than_there_is_in_a_batch(key):
-    algorithm = Offline(counting(), Tally(), batch_size=50)
+    algorithm = Offline(counting(), Tally(), batch_size=50).with_horizon(100)
     assert algorithm._sample(None, key).transitions.reward.shape == (50,)
 
 
@@ -154,7 +153,7 @@ def test_what_is_refused(make, words):
 def test_a_single_episode_of_one_step(key):
     dataset = counting((1,))
     learner = DQN(network=GRU(4, MLP(3)))
-    algorithm = Offline(dataset, learner, batch_size=2, length=3)
+    algorithm = Offline(dataset, learner, batch_size=2, length=3).with_horizon(100)
     _, (metrics, _) = algorithm.step(algorithm.init(key), key)
     assert math.isfinite(float(metrics["q_loss"]))
     assert eqx.tree_equal(dataset.take([0]), dataset)

@@ -47,6 +47,8 @@ def perform(name: str, given: argparse.Namespace, groups: dict[str, dict[str, An
         if isinstance(error, json.JSONDecodeError):
             raise
         return _say(str(error), WRONG)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         return _say(
             f"{error.strerror or error}{f' ({error.filename})' if error.filename else ''}: "
@@ -94,15 +96,22 @@ def _config_file(path: str) -> dict[str, Any]:
         raise RequestError(f"there is no configuration file {path}") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RequestError(f"the configuration file {path} is not JSON: {error}") from error
+    except OSError as error:
+        raise RequestError(f"the configuration file {path} cannot be read: {error.strerror or error}") from error
     if not isinstance(data, dict):
         raise RequestError(
             f"the configuration file {path} must hold an object with learner, loop, env, steps or num_envs"
         )
+    wrong = [name for name in ("learner", "loop", "env") if not isinstance(data.get(name, {}), dict)]
+    if wrong:
+        raise RequestError(
+            f"the entry {wrong[0]!r} of the configuration file {path} must be an object, not {data[wrong[0]]!r}"
+        )
     if "format" in data:
         env = data.get("env", {})
         data = {
-            "learner": _without_class(data["learner"]),
-            "loop": _without_class(data["loop"]),
+            "learner": _without_class(data.get("learner", {})),
+            "loop": _without_class(data.get("loop", {})),
             "steps": data.get("steps"),
             "env": env.get("kwargs", {}),
             "num_envs": env.get("num_envs"),

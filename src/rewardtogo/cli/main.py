@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 from ..catalogue import ALGORITHMS, ENVIRONMENTS, nearest
 
 INTERRUPTED, WRONG = 130, 2
+MOST_EPISODES = 1_000_000
 
 
 class RequestError(Exception):
@@ -24,7 +25,31 @@ class Parser(argparse.ArgumentParser):
 
 
 def _number(text: str) -> float:
-    return float(text.replace("_", ""))
+    try:
+        return float(text.replace("_", ""))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"it must be a number, not {text!r}") from None
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text.replace("_", ""))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"it must be a whole number, not {text!r}") from None
+
+
+def _seed(text: str) -> int:
+    if not 0 <= _whole(text) < 2**32:
+        raise argparse.ArgumentTypeError(f"a seed is a whole number from 0 to 2^32 - 1, not {text}")
+    return _whole(text)
+
+
+def _episodes(text: str) -> int:
+    if not 1 <= _whole(text) <= MOST_EPISODES:
+        raise argparse.ArgumentTypeError(
+            f"there must be at least one episode and at most {MOST_EPISODES:,}, not {text}"
+        )
+    return _whole(text)
 
 
 def _parsers() -> tuple[Parser, dict[str, Parser]]:
@@ -46,12 +71,12 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     def limits(parser: Parser) -> None:
         parser.add_argument("--steps", type=_number, help="environment steps (gradient steps offline)")
         parser.add_argument(
-            "--stop-at-return", type=float, metavar="R", help="stop when an evaluation reaches this return"
+            "--stop-at-return", type=_number, metavar="R", help="stop when an evaluation reaches this return"
         )
         parser.add_argument(
-            "--time-limit", type=float, metavar="SECONDS", help="stop after so many seconds of training"
+            "--time-limit", type=_number, metavar="SECONDS", help="stop after so many seconds of training"
         )
-        parser.add_argument("--checkpoint-every", type=float, default=60.0, metavar="SECONDS", help="default 60")
+        parser.add_argument("--checkpoint-every", type=_number, default=60.0, metavar="SECONDS", help="default 60")
         parser.add_argument("--tensorboard", action="store_true", help="also write TensorBoard events")
         parser.add_argument("--wandb", action="store_true", help="also log to Weights & Biases")
         parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -66,11 +91,11 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument(
         "env", metavar="ENV", nargs="?", help="a Gymnasium id (module:Id included) or one of `rtg list --envs`"
     )
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_seed, default=0)
     p.add_argument(
-        "--num-seeds", type=int, default=1, metavar="K", help="train K seeds in one program, one folder each"
+        "--num-seeds", type=_whole, default=1, metavar="K", help="train K seeds in one program, one folder each"
     )
-    p.add_argument("--num-envs", type=int, metavar="B", help="environments side by side")
+    p.add_argument("--num-envs", type=_whole, metavar="B", help="environments side by side")
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
     p.add_argument("--backend", default="auto", help="auto, jax (compiled twin) or gymnasium")
     p.add_argument(
@@ -99,18 +124,18 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     limits(p)
     p = command("eval", "play whole episodes and print the mean return with its confidence interval")
     run_argument(p)
-    p.add_argument("--episodes", type=int, default=100, metavar="N")
+    p.add_argument("--episodes", type=_episodes, default=100, metavar="N")
     p.add_argument("--env", metavar="ENV", help="another environment than the one trained in")
     p.add_argument("--backend", default=None, help="auto, jax or gymnasium (default: the run's)")
     p.add_argument("--checkpoint", default="last", metavar="best|last|N")
     p.add_argument("--stochastic", action="store_true", help="sample actions")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_seed, default=0)
     p.add_argument("--learner-class", metavar="MODULE:CLASS")
     p.add_argument("--json", action="store_true")
     p = command("play", "render an episode to a GIF or an MP4")
     run_argument(p)
     p.add_argument("--out", metavar="FILE.gif|FILE.mp4", help="default RUN/episode.gif")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_seed, default=0)
     p.add_argument("--checkpoint", default="last", metavar="best|last")
     p.add_argument("--stochastic", action="store_true")
     p = command("plot", "draw learning curves, several seeds as a mean with a band")
@@ -127,10 +152,10 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument("--json", action="store_true")
     p = command("collect", "play demonstrations with a trained policy into a dataset")
     run_argument(p)
-    p.add_argument("--episodes", type=int, default=10, metavar="N")
+    p.add_argument("--episodes", type=_episodes, default=10, metavar="N")
     p.add_argument("--out", metavar="DATASET")
     p.add_argument("--stochastic", action="store_true", help="sample actions")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_seed, default=0)
     p.add_argument("--json", action="store_true")
     p = command("export", "write the policy for use without this library")
     run_argument(p)
@@ -140,7 +165,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p = command("figure", "redraw a figure or experiment of the notes")
     p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
     p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_seed, default=0)
     return main, table
 
 

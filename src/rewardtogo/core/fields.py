@@ -176,6 +176,8 @@ def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
         wants_int = field.type is int or field.type == "int"
         if wants_int and (isinstance(value, bool) or not isinstance(value, (int, np.integer))):
             raise ValueError(f"{owner}.{field.name} must be a whole number in {span}, not {value!r}")
+        if wants_int and abs(value) >= 2**31:
+            raise ValueError(f"{owner}.{field.name} must be in {span} and less than 2^31, not {value}")
         values = (value,) if wants_int else ()
     for item in values:
         if not span.holds(item):

@@ -29,7 +29,7 @@ class Timestep(eqx.Module):
     - `terminated`: the episode ended in a terminal state, whose value is 0.
     - `truncated`: the episode was cut (a time limit), so that the value of `final_observation` still counts (erratum E1.5).
     - `final_observation`: where the action led, before any reset. Equal to `observation` inside an episode.
-    - `extras`: declared by the environment, with fixed names, such as `is_success`.
+    - `extras`: declared by the environment, with fixed names, such as `is_success` or `raw_reward`.
     """
 
     observation: Observation
@@ -43,6 +43,11 @@ class Timestep(eqx.Module):
     def done(self) -> Bool[Array, "..."]:
         """Whether the episode is over, either way."""
         return self.terminated | self.truncated
+
+    @property
+    def score(self) -> Float[Array, "..."]:
+        """What counts for an episode's return: the reward before any wrapper scaled or replaced it (`extras["raw_reward"]`)."""
+        return self.extras.get("raw_reward", self.reward)
 
 
 class Transition(eqx.Module):

@@ -50,7 +50,7 @@ def begin(env: VectorEnv, policy: Policy, key: PRNGKey) -> Actor:
     env_state, observation = env.reset(jax.random.split(env_key, env.num_envs))
     carry = fresh_carry(policy, carry_key, env.num_envs)
     zeros = jnp.zeros(env.num_envs)
-    return Actor(env_state, observation, carry, EpisodeStats(zeros, zeros))
+    return shard(Actor(env_state, observation, carry, EpisodeStats(zeros, zeros)))
 
 
 def fresh_carry(policy: Policy, key: PRNGKey, num_envs: int) -> Carry:
@@ -90,7 +90,7 @@ def collect(
         carry, action, extras = jax.vmap(lambda c, o, k: policy(c, o, k))(actor.carry, actor.observation, keys[0])
         env_state, timestep = env.step(actor.env_state, action_spec.clip(action), keys[1])
         done = timestep.done
-        total = actor.stats.return_so_far + timestep.reward
+        total = actor.stats.return_so_far + timestep.score
         steps = actor.stats.length_so_far + 1.0
         extras = {**extras, "carry": actor.carry} if keep_carry else extras
         ended = done.astype(jnp.float32)

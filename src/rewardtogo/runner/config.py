@@ -7,6 +7,8 @@ by its fields and the name of its class. Reading runs nothing that the data name
 import dataclasses
 import importlib
 import inspect
+import math
+import types
 import typing
 from typing import Any
 
@@ -28,14 +30,15 @@ def resolve(path: str) -> Any:
         raise ValueError(f"{path!r} is not of the form module:Class")
     try:
         found: Any = importlib.import_module(module)
-    except ImportError as error:
+    except Exception as error:
         raise ValueError(f"the module {module!r} of {path!r} cannot be imported: {error}") from error
     for step in name.split("."):
-        if step not in vars(found):
+        inside = vars(found) if isinstance(found, (types.ModuleType, type)) else {}
+        if step not in inside:
             raise ValueError(
-                f"the module {module!r} has no {name!r}: {nearest(name, [k for k in vars(found) if not k.startswith('_')])}"
+                f"the module {module!r} has no {name!r}: {nearest(name, [k for k in inside if not k.startswith('_')])}"
             )
-        found = vars(found)[step]
+        found = inside[step]
     return found
 
 
@@ -84,7 +87,15 @@ def build(cls: type, data: dict[str, Any], **fixed: Any) -> Any:
         values[name] = _value(cls, known[name], value)
     values |= fixed
     splat = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.VAR_POSITIONAL]
-    return cls(*(values.pop(splat[0], ()) if splat else ()), **values)
+    several = values.pop(splat[0], ()) if splat else ()
+    if not isinstance(several, tuple):
+        raise ValueError(f"{cls.__name__}.{splat[0]} must be a list, such as [64, 64], not {several!r}")
+    try:
+        return cls(*several, **values)
+    except TypeError as error:
+        raise ValueError(
+            f"{cls.__name__} cannot be made from the options {', '.join(values) or '(none)'}: {error}"
+        ) from error
 
 
 def _value(cls: type, field: dataclasses.Field, value: Any) -> Any:
@@ -92,13 +103,24 @@ def _value(cls: type, field: dataclasses.Field, value: Any) -> Any:
     hint = _hint(cls, field)
     if field.metadata.get("part") or hint in (Network, Network | None):
         return _part(where, field, value)
+    if isinstance(value, dict):
+        raise ValueError(f"{where} is one value and has no options of its own, such as {next(iter(value), '')!r}")
     if field.metadata.get("traced"):
         if isinstance(value, str):
-            return parse_schedule(value)
+            return _schedule(where, value)
         return value
-    if not isinstance(value, str):
-        return tuple(value) if isinstance(value, list) else value
-    return _from_text(where, hint, value)
+    value = _from_text(where, hint, value) if isinstance(value, str) else value
+    value = tuple(value) if isinstance(value, list) else value
+    if isinstance(value, tuple) and any(isinstance(n, int) and abs(n) >= 2**31 for n in value):
+        raise ValueError(f"{where} must be whole numbers less than 2^31, not {' '.join(map(str, value))}")
+    return value
+
+
+def _schedule(where: str, text: str) -> float | Schedule:
+    try:
+        return parse_schedule(text)
+    except ValueError as error:
+        raise ValueError(f"{where} cannot be that: {error}") from None
 
 
 def _hint(cls: type, field: dataclasses.Field) -> Any:
@@ -138,7 +160,7 @@ def _from_text(where: str, hint: Any, text: str) -> Any:
 
 
 def _whole(value: float) -> int:
-    if value != int(value):
+    if not math.isfinite(value) or value != int(value):
         raise ValueError
     return int(value)
 

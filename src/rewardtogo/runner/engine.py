@@ -7,6 +7,7 @@ for NaN. Where a chunk ends does not show in any result: rows of metrics end at 
 
 import dataclasses
 import math
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -15,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Key
 
 from ..core import Algorithm, Episodes, State
@@ -100,9 +102,29 @@ class Program:
 
     def _compile(self, function: Callable, *arguments: Any, **options: Any) -> Any:
         began = time.perf_counter()
-        compiled = jax.jit(function, **options).lower(*arguments).compile()
+        compiled = self.guarded(lambda: jax.jit(function, **options).lower(*arguments).compile())
         self.compile_seconds += time.perf_counter() - began
         return compiled
+
+    def trial(self) -> None:
+        """Go through one iteration without computing it: what cannot be is refused before anything is compiled or written.
+
+        Raises `ValueError` for what the algorithm refuses, and for a state that is larger than the machine's memory.
+        """
+        try:
+            state = self.shapes()
+            self._table_shape(state)
+        except OverflowError as error:
+            raise ValueError(
+                f"a size among the options is too large to count with, give smaller ones: {error}"
+            ) from error
+        size = sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(state))
+        memory = _memory()
+        if memory is not None and size > memory:
+            raise ValueError(
+                f"what is to be trained takes {size / 1e9:,.1f} GB and this machine has {memory / 1e9:,.1f} GB: make the "
+                "network, the replay, or the number of environments or seeds smaller"
+            )
 
     def shapes(self) -> State:
         """Structure, shapes and types of the state, without computing it."""
@@ -143,7 +165,17 @@ class Program:
             self._table_shape(state)
             function = partial(self._chunk, structure, tuple(large))
             self._advance = self._compile(
-                function, self.algorithm, big, small, sums, self.key, 0, 0, 1, donate_argnums=1
+                function,
+                self.algorithm,
+                big,
+                small,
+                sums,
+                self.key,
+                0,
+                0,
+                1,
+                donate_argnums=1,
+                out_shardings=_places((leaves, sums)),
             )
         new, sums, table = self.guarded(
             lambda: self._advance(self.algorithm, big, small, sums, self.key, start, stop, self.row_every)
@@ -234,7 +266,30 @@ class Program:
             failure = failure_of(self.algorithm)
             if failure is not None:
                 raise failure from error
+            if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error):
+                raise ValueError(
+                    f"an iteration takes more memory than there is ({str(error).partition(': ')[2]}): make the network, the "
+                    "batch, the unroll, the replay, or the number of environments or seeds smaller"
+                ) from error
             raise
+
+
+def _places(arguments: tuple[list[Array], Array]) -> Any:
+    """Where a chunk puts what it gives back: where it got it from, so that the next call takes it as it is. None on one device."""
+    mesh = jax.sharding.get_mesh()
+    if mesh.empty:
+        return None
+    whole = NamedSharding(mesh, PartitionSpec())
+    place = lambda x: x.sharding if isinstance(x, jax.Array) and isinstance(x.sharding, NamedSharding) else whole  # noqa: E731
+    return (*jax.tree.map(place, arguments), whole)
+
+
+def _memory() -> int | None:
+    """Bytes of memory of the device, or of the machine where it is the device; None where nobody says."""
+    statistics = jax.devices()[0].memory_stats()
+    if statistics and "bytes_limit" in statistics:
+        return statistics["bytes_limit"]
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if os.name == "posix" else None
 
 
 def _all_finite(tree: State) -> State:

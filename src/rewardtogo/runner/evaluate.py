@@ -50,7 +50,7 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
         carry, action, _ = choose(actor.carry, actor.observation, jax.random.split(act_key, lanes))
         env_state, timestep = env.step(actor.env_state, action_spec.clip(action), jax.random.split(env_key, lanes))
         done = timestep.done
-        total, length = actor.stats.return_so_far + timestep.reward, actor.stats.length_so_far + 1.0
+        total, length = actor.stats.return_so_far + timestep.score, actor.stats.length_so_far + 1.0
         here = (jnp.arange(quota, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
         found = Returns(
             jnp.where(here, total[None, :], found.returns),

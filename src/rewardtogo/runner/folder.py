@@ -19,6 +19,14 @@ from ..data.files import FORMAT, Damaged, load_tree, read_json, save_tree, sync,
 KEEP = 2
 """Checkpoints that are kept: the last one and the one before it."""
 FIRST_COLUMNS = ("iteration", "env_steps", "return_mean", "length_mean", "episodes", "seconds")
+CONFIG = {name: int for name in ("seed", "steps", "iterations", "row_every", "eval_every", "eval_episodes")} | {
+    "algorithm": str,
+    "env": dict,
+    "learner": dict,
+    "loop": dict,
+}
+CONFIG_ENV = {"id": str, "backend": str, "num_envs": int, "kwargs": dict, "by_name": bool}
+"""What a run's configuration cannot do without."""
 LAST_COLUMNS = ("eval_return_mean", "eval_return_stochastic")
 
 
@@ -84,19 +92,12 @@ class RunFolder:
             raise Damaged(
                 f"{file} has format {data['format']}, which is newer than this library's {FORMAT}: install a newer rewardtogo"
             )
-        missing = {
-            "algorithm",
-            "env",
-            "learner",
-            "loop",
-            "seed",
-            "steps",
-            "iterations",
-            "row_every",
-            "eval_every",
-        } - set(data)
-        if missing:
-            raise Damaged(f"{file} is damaged: it has no {sorted(missing)[0]!r}")
+        for part, wanted in ((data, CONFIG), (data.get("env"), CONFIG_ENV), (data.get("loop"), {"class": str})):
+            for name, kind in wanted.items():
+                value = part.get(name) if isinstance(part, dict) else None
+                least = 0 if name in ("seed", "num_envs") else 1
+                if not isinstance(value, kind) or (kind is int and isinstance(value, int) and value < least):
+                    raise Damaged(f"{file} is damaged: its {name!r} is {'missing' if value is None else repr(value)}")
         return data
 
     # --- checkpoints -----------------------------------------------------------------------------------------------------------
@@ -110,16 +111,21 @@ class RunFolder:
         names = self._checkpoints.iterdir() if self._checkpoints.exists() else ()
         return sorted(int(p.name) for p in names if p.is_dir() and p.name.isdigit())
 
+    def checkpoint_folder(self, iteration: int) -> Path:
+        """Where the checkpoint of an iteration is, if there is one."""
+        return self._checkpoints / f"{iteration:08d}"
+
     def save_checkpoint(self, iteration: int, state: Any, about: dict[str, Any]) -> None:
         """Write a checkpoint under a temporary name, sync it, rename it, and only then remove the oldest.
 
         Raises `OSError` where the disk is full or cannot be written; what was there before is whole then.
         """
-        final = self._checkpoints / f"{iteration:08d}"
+        final = self.checkpoint_folder(iteration)
         if final.exists():
             return
         temporary = self._checkpoints / f".{final.name}.tmp"
-        shutil.rmtree(temporary, ignore_errors=True)
+        for half_written in self._checkpoints.glob(".*.tmp"):  # by a process that was killed
+            shutil.rmtree(half_written, ignore_errors=True)
         try:
             temporary.mkdir(parents=True)
             save_tree(temporary / "state.safetensors", state, {"content": "checkpoint"})
@@ -137,7 +143,7 @@ class RunFolder:
 
     def load_checkpoint(self, iteration: int, like: Any) -> tuple[Any, dict[str, Any]]:
         """The state and what was said of it. Raises `Damaged`, naming the file, where it cannot be used."""
-        folder = self._checkpoints / f"{iteration:08d}"
+        folder = self.checkpoint_folder(iteration)
         if not folder.exists():
             have = ", ".join(map(str, self.iterations())) or "none"
             raise Damaged(f"{self.path} has no checkpoint {iteration} (it has {have})")

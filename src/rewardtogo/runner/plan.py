@@ -10,7 +10,8 @@ import jax
 
 from .. import presets
 from ..catalogue import ALGORITHMS, LOOPS, algorithm_row
-from ..core import Algorithm, Environment, Learner, VectorEnv
+from ..core import Algorithm, Environment, Learner, VectorEnv, env_spec
+from ..data.checks import require_spec
 from ..data.episodes import load_dataset
 from ..envs.gymnasium import hosted
 from ..envs.registry import COMPILED, make
@@ -21,6 +22,7 @@ from .evaluate import lanes_for
 from .policy import restore_learner
 
 DEFAULT_STEPS = 100_000
+MOST_ITERATIONS, MOST_HOSTED = 2**31 - 1, 10_000
 ROWS, EVALUATIONS = 200, 10
 """How many rows of metrics and how many evaluations a run has, about."""
 
@@ -67,6 +69,7 @@ def plan(
     env_name = env if isinstance(env, str) else _title(env)
     ready = _preset(preset, name, env_name)
     check_budget(steps, seed)
+    _check_num_envs(num_envs, env, backend, env_kwargs)
     if isinstance(algorithm, Algorithm):
         if learner or loop:
             raise ValueError(
@@ -92,8 +95,12 @@ def plan(
                 )
             dataset = load_dataset(data) if isinstance(data, str) else data
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            if vector_env is not None:
+                require_spec(dataset.spec, env_spec(vector_env), "the data")
             whole = build(cls, options, dataset=dataset, learner=inner)
         else:
+            if env is None:
+                raise ValueError(f"{name} learns by acting and was given no environment: name one, such as CartPole-v1")
             number = (
                 num_envs
                 if num_envs is not None or not isinstance(env, (str, Environment))
@@ -102,7 +109,7 @@ def plan(
             vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
             whole = build(cls, options, env=vector_env, learner=inner)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
-    iterations = iterations_for(whole, steps)
+    iterations = _iterations(whole, steps)
     row_every = max(1, iterations // ROWS)
     eval_every = max(1, round(iterations / max(1, evaluations) / row_every)) * row_every
     whole = whole.with_horizon(iterations)
@@ -163,7 +170,7 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
     config = dict(config)
     if steps is not None:
         check_budget(steps, config["seed"])
-        iterations = iterations_for(whole, steps)
+        iterations = _iterations(whole, steps)
         if iterations < config["iterations"]:
             raise ValueError(
                 f"the run's budget is {config['steps']} steps already: --steps can extend it, and {steps} is less"
@@ -176,13 +183,39 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
 def check_budget(steps: Any, seed: Any) -> None:
     """Raise `ValueError` unless steps and seed are whole numbers that make sense."""
     if steps is not None and (
-        isinstance(steps, bool) or not isinstance(steps, (int, float)) or not math.isfinite(steps) or steps < 1
+        isinstance(steps, bool)
+        or not isinstance(steps, (int, float))
+        or not math.isfinite(steps)
+        or steps < 1
+        or steps != int(steps)
     ):
-        raise ValueError(f"the number of steps must be at least 1, not {steps}")
+        raise ValueError(f"the number of steps must be a whole number of at least 1, not {steps}")
     if steps is not None and steps > 1e15:
         raise ValueError(f"{steps:g} steps would take centuries: give at most 1e15")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
         raise ValueError(f"a seed is a whole number from 0 to 2^32 - 1, not {seed}")
+
+
+def _iterations(algorithm: Algorithm, steps: int) -> int:
+    iterations = iterations_for(algorithm, steps)
+    if iterations >= MOST_ITERATIONS:
+        raise ValueError(
+            f"{steps:,} steps are {iterations:,} iterations of {algorithm.steps_per_iteration} steps, and an iteration's number "
+            "must be less than 2^31 - 1: ask for fewer steps, or for more in an iteration (--loop.unroll, --num-envs)"
+        )
+    return iterations
+
+
+def _check_num_envs(number: Any, env: Any, backend: str, kwargs: dict[str, Any] | None) -> None:
+    if number is None:
+        return
+    if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+        raise ValueError(f"there must be at least one environment and a whole number of them, not {number}")
+    hosted_by_name = isinstance(env, str) and (env not in COMPILED or backend == "gymnasium" or bool(kwargs))
+    if hosted_by_name and number > MOST_HOSTED:
+        raise ValueError(
+            f"{number} Gymnasium environments side by side would each live in this process: ask for at most {MOST_HOSTED}"
+        )
 
 
 def versions() -> dict[str, str]:
@@ -226,7 +259,7 @@ def _learner(algorithm: str | Learner, data: dict[str, Any]) -> Learner:
         return algorithm
     cls = resolve(algorithm if ":" in algorithm else algorithm_row(algorithm).path)
     if not (isinstance(cls, type) and issubclass(cls, Learner)):
-        raise ValueError(f"{algorithm} is not a rewardtogo.Learner")
+        raise ValueError(f"{algorithm} is no learner: name a class that derives from rewardtogo.Learner")
     return build(cls, data)
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from ..data.files import Damaged
 from .folder import RunFolder
 
 ENDINGS = (".png", ".svg", ".pdf", ".jpg", ".webp")
@@ -61,12 +60,11 @@ def _metrics(folder: RunFolder) -> dict[str, np.ndarray]:
 
 
 def smooth(values: np.ndarray, share: float = 0.1) -> np.ndarray:
-    """Means over a window of about `share` of the curve, centred, shorter at both ends."""
-    half = int(len(values) * share / 2)
+    """Means over a window of about `share` of the curve, centred, cut off at both ends."""
+    half, at = int(len(values) * share / 2), np.arange(len(values))
     sums = np.concatenate([[0.0], np.cumsum(values)])
-    at = np.arange(len(values))
-    reach = np.minimum(half, np.minimum(at, len(values) - 1 - at))
-    return (sums[at + reach + 1] - sums[at - reach]) / (2 * reach + 1)
+    first, last = np.maximum(at - half, 0), np.minimum(at + half + 1, len(values))
+    return (sums[last] - sums[first]) / (last - first)
 
 
 def band(curves: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,7 +104,8 @@ def draw_curves(paths: Sequence[str | Path], out: str | Path) -> Path:
     for i, (name, members) in enumerate(groups.items()):
         style = {"color": COLOURS[i % len(COLOURS)], "linestyle": DASHES[i // len(COLOURS) % len(DASHES)]}
         _draw_group(axes, name.split(" · ")[0] if same else name, members, style)
-    _dress(axes, folders, next(iter(groups)) if len(groups) == 1 else next(iter(groups)).split(" · ")[1] if same else "")
+    title = "" if not same else next(iter(groups)).split(" · ")[1] if len(groups) > 1 else next(iter(groups))
+    _dress(axes, folders, title)
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         figure.savefig(file, dpi=130)
@@ -118,36 +117,35 @@ def draw_curves(paths: Sequence[str | Path], out: str | Path) -> Path:
 def _draw_group(axes: Axes, name: str, members: Sequence[RunFolder], style: dict[str, Any]) -> None:
     """The line of one algorithm in one environment."""
     curves = [c for c in map(curve, members) if len(c[0])]
-    dots = [d for d in map(evaluations, members) if len(d[0])]
     if not curves:
         return
-    label = name if len(curves) == 1 else f"{name}, mean of {len(curves)} seeds and its 95 % interval"
-    if len(curves) == 1:
-        steps, returns = curves[0]
-        learned = not np.all(np.isnan(_metrics(members[0])["return_mean"]))
-        calm = smooth(returns) if learned else returns
-        if not np.array_equal(calm, returns):
-            axes.plot(steps, returns, color=style["color"], alpha=0.25, lw=1, zorder=1)
-            label += ", running mean"
-        axes.plot(steps, calm, label=label, lw=1.8, zorder=3, **style)
-    else:
+    if len(curves) > 1:
         steps, mean, half = band(curves)
+        label = f"{name}, mean of {len(curves)} seeds and its 95 % interval"
         axes.plot(steps, mean, label=label, lw=1.8, zorder=3, **style)
         axes.fill_between(steps, mean - half, mean + half, color=style["color"], alpha=0.18, lw=0, zorder=2)
-    if dots:
-        same = len({len(d[0]) for d in dots}) == 1 and np.all(np.ptp([d[0] for d in dots], axis=0) == 0)
-        steps, returns = (dots[0][0], np.mean([d[1] for d in dots], axis=0)) if same else map(np.concatenate, zip(*dots, strict=True))
-        axes.plot(
-            steps,
-            returns,
-            linestyle="",
-            marker="o",
-            ms=4.5,
-            mfc="white",
-            mec=style["color"],
-            label="evaluation, without exploring" if len(dots) == 1 else "evaluations, without exploring, mean of seeds" if same else "evaluations, without exploring",
-            zorder=4,
-        )
+    else:
+        steps, returns = curves[0]
+        calm = smooth(returns)
+        if np.allclose(calm, returns):
+            axes.plot(steps, returns, label=name, lw=1.8, zorder=3, **style)
+        else:
+            axes.plot(steps, returns, color=style["color"], alpha=0.25, lw=1, zorder=1)
+            axes.plot(steps, calm, label=f"{name}, running mean", lw=1.8, zorder=3, **style)
+    _draw_evaluations(axes, members, style["color"])
+
+
+def _draw_evaluations(axes: Axes, members: Sequence[RunFolder], colour: str) -> None:
+    """A dot an evaluation, or the mean of the seeds where all were evaluated at the same steps."""
+    dots = [d for d in map(evaluations, members) if len(d[0])]
+    if not dots:
+        return
+    label = "evaluation, without exploring"
+    steps, returns = (np.concatenate(parts) for parts in zip(*dots, strict=True))
+    if len(dots) > 1 and all(np.array_equal(d[0], dots[0][0]) for d in dots):
+        steps, returns = dots[0][0], np.mean([d[1] for d in dots], axis=0)
+        label = "evaluation, without exploring, mean"
+    axes.plot(steps, returns, linestyle="", marker="o", ms=4.5, mfc="white", mec=colour, label=label, zorder=4)
 
 
 def _dress(axes: Axes, folders: Sequence[RunFolder], title: str) -> None:
@@ -158,6 +156,8 @@ def _dress(axes: Axes, folders: Sequence[RunFolder], title: str) -> None:
     axes.set_xlabel("gradient steps" if offline else "environment steps")
     axes.set_ylabel("return of an episode")
     axes.set_title(title, fontsize=11)
+    # Long numbers need more room than Matplotlib leaves them.
+    axes.xaxis.set_major_locator(MaxNLocator(8 if axes.get_xlim()[1] < 1e6 else 5))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.0f}"))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,.6g}"))
     axes.margins(x=0.02)
@@ -166,5 +166,3 @@ def _dress(axes: Axes, folders: Sequence[RunFolder], title: str) -> None:
     if axes.lines:
         axes.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
 
-
-__all__ = ["Damaged", "band", "curve", "draw_curves", "evaluations", "group_name", "run_folders", "smooth", "student"]

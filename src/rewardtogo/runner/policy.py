@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from safetensors import SafetensorError
 
 from ..catalogue import ALGORITHMS
 from ..core import MASK, EnvSpec, Learner, Policy, Spec
@@ -23,8 +24,11 @@ def save_policy(folder: Path, learner: Learner, state: Any, spec: EnvSpec, about
         "observation": spec.observation.to_json(),
         "action": spec.action.to_json(),
     }
-    save_tree(folder / "policy.safetensors", policies(learner, state), {"content": "policy"})
-    write_json(folder / "policy.json", data)
+    try:
+        save_tree(folder / "policy.safetensors", policies(learner, state), {"content": "policy"})
+        write_json(folder / "policy.json", data)
+    except SafetensorError as error:
+        raise OSError(f"the policy {folder / 'policy.safetensors'} could not be written: {error}") from error
 
 
 def policies(learner: Learner, state: Any) -> dict[str, Policy]:

@@ -75,6 +75,14 @@ class WandB(Sink):
 SINKS = {"tensorboard": TensorBoard, "wandb": WandB}
 
 
+def require_sinks(names: Sequence[str]) -> None:
+    """Raise `ValueError` unless all of these sinks exist and what they need is installed."""
+    for name in names:
+        if name not in SINKS:
+            raise ValueError(f"there is no sink {name!r}: choose from {', '.join(SINKS)}")
+        _imported(name, name)
+
+
 def _finite(row: Row) -> dict[str, float]:
     return {name: float(value) for name, value in row.items() if value is not None and np.isfinite(value)}
 

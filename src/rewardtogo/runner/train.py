@@ -1,6 +1,8 @@
 """`train` and `resume`: a run from its plan to its folder, whatever happens on the way."""
 
+import contextlib
 import dataclasses
+import shutil
 import signal
 import sys
 import threading
@@ -15,20 +17,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import Actor, Algorithm, Learner, State
-from ..data.files import Damaged, write_json
-from ..envs.gymnasium import hosted
+from ..core import Actor, Algorithm, Learner, Schedule, State
+from ..data.files import Damaged, is_key, read_json, write_json
+from ..envs.gymnasium import EnvironmentFailure, hosted
+from ..ops.schedules import Constant, to_text
 from .engine import Callback, Every, Moment, Program, run, steps_after
 from .evaluate import Evaluator, lanes_for, summary
 from .folder import RunFolder, new_folders
-from .plan import Plan, from_config, plan
+from .plan import Plan, check_budget, from_config, plan
 from .plot import draw_curves
 from .policy import LoadedPolicy, load, save_policy
 from .progress import Reporter
-from .sinks import CSV, SINKS, Sink
+from .sinks import CSV, SINKS, Sink, require_sinks
 
+LARGE_STATE = 2**26
+"""Bytes from which writing a checkpoint takes so long that it is done more rarely."""
 FINAL_EPISODES = 100
 """Episodes of the evaluation at the end, on which the confidence interval rests."""
+MOST_SEEDS = 10_000
 
 
 class Interrupted(KeyboardInterrupt):
@@ -93,11 +99,19 @@ class Limits:
     checkpoint_every: float = 60.0
 
     def __post_init__(self) -> None:
-        for name, value, least in (("time_limit", self.time_limit, 0), ("checkpoint_every", self.checkpoint_every, 0)):
-            if value is not None and not value > least:
-                raise ValueError(f"{name.replace('_', ' ')} must be more than {least} seconds, not {value}")
+        for name, value in (("limit", self.time_limit), ("between two checkpoints", self.checkpoint_every)):
+            if value is not None and not value > 0:
+                raise ValueError(f"the time {name} must be more than 0 seconds, not {value:g}")
         if self.stop_at_return is not None and not np.isfinite(self.stop_at_return):
             raise ValueError(f"the return to stop at must be a finite number, not {self.stop_at_return}")
+
+
+def program_of(plan: Plan, seeds: Sequence[int]) -> Program:
+    """What trains these seeds, together where there are several; it has gone through an iteration, so the plan can be executed."""
+    keys = [jax.random.key(seed) for seed in seeds]
+    program = Program(plan.algorithm, jnp.stack(keys) if len(keys) > 1 else keys[0], plan.config["row_every"])
+    program.trial()
+    return program
 
 
 class Session:
@@ -111,12 +125,12 @@ class Session:
         limits: Limits,
         sinks: Sequence[str],
         quiet: bool,
+        program: Program | None = None,
     ):
         self.plan, self.folders, self.seeds, self.limits = plan, list(folders), list(seeds), limits
         self.batched = len(seeds) > 1
-        keys = [jax.random.key(seed) for seed in seeds]
-        self.key = jnp.stack(keys) if self.batched else keys[0]
-        self.program = Program(plan.algorithm, self.key, plan.config["row_every"])
+        self.program = program or program_of(plan, seeds)
+        self.key = self.program.key
         episodes = plan.config["eval_episodes"]
         self.evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, episodes, self.batched)
         self.sinks: list[list[Sink]] = [
@@ -125,6 +139,7 @@ class Session:
         self.reporter_quiet = quiet
         self.best = np.full(len(seeds), -np.inf)
         self.seconds_before, self.last_checkpoint = 0.0, time.monotonic()
+        self.checkpoint_pause = limits.checkpoint_every
         self.reached = False
 
     # --- one seed out of several -----------------------------------------------------------------------------------------------
@@ -169,6 +184,7 @@ class Session:
 
     def checkpoint(self, moment: Moment) -> None:
         """Write the whole state of every seed."""
+        began = time.monotonic()
         states = RunState(
             moment.state,
             jnp.moveaxis(moment.sums, -1, 0) if self.batched else moment.sums,
@@ -177,9 +193,17 @@ class Session:
         about = {"env_steps": moment.env_steps, "seconds": self.seconds_before + moment.seconds}
         for folder, state in zip(self.folders, self._each(states), strict=True):
             folder.save_checkpoint(moment.iteration, state, about)
+        self.save_policies(moment)
+        size = sum(x.nbytes for x in jax.tree.leaves(states) if not is_key(x))
+        if size > LARGE_STATE:
+            # A replay of gigabytes takes its time to write: spend at most a twentieth of the run on it.
+            self.checkpoint_pause = max(self.limits.checkpoint_every, 20 * (time.monotonic() - began))
+        self.last_checkpoint = time.monotonic()
+
+    def save_policies(self, moment: Moment) -> None:
+        """Write the policy of every seed as it is now."""
         for folder, state in zip(self.folders, self._each(self.plan.algorithm.learned(moment.state)), strict=True):
             self._save_policy(folder.path, state, moment.env_steps, None)
-        self.last_checkpoint = time.monotonic()
 
     def _policy(self, state: State, explore: bool) -> Any:
         make: Callable = lambda s: self.plan.algorithm.policy(s, explore)  # noqa: E731
@@ -209,7 +233,7 @@ class Session:
             self.write_rows(moment)
             reporter.update(moment.env_steps, moment.seconds, moment.compile_seconds, moment.rows)
             late = self.limits.time_limit is not None and time.monotonic() - began >= self.limits.time_limit
-            if asked.raised or late or time.monotonic() - self.last_checkpoint >= self.limits.checkpoint_every:
+            if asked.raised or late or time.monotonic() - self.last_checkpoint >= self.checkpoint_pause:
                 self.checkpoint(moment)
             return asked.raised or late
 
@@ -225,7 +249,7 @@ class Session:
                     resume_from=resume_from,
                     program=self.program,
                 )
-                moment = last[0]
+                moment = last[0] if last else self._resumed(resume_from)
                 if moment.iteration not in self.folders[0].iterations():
                     self.checkpoint(moment)
                 if asked.raised:
@@ -242,8 +266,23 @@ class Session:
             for env in hosted((self.plan.env, self.plan.eval_env)):
                 env.close()
 
+    def _resumed(self, resume_from: Any) -> Moment:
+        """The end of a run that was stopped after its last iteration and before its last evaluation."""
+        state, sums, done = resume_from
+        moment = Moment(self.plan.algorithm, state, sums, done, self.plan.iterations, [], 0.0, 0.0)
+        self.save_policies(moment)
+        return moment
+
+    def finished(self) -> bool:
+        """Whether the whole budget was trained and evaluated: `evaluation.json` is the last thing that a run writes."""
+        wanted = self.plan.config["steps"]
+        if self.evaluator is None:
+            return all((folder.path / "curve.png").exists() for folder in self.folders)
+        files = [folder.path / "evaluation.json" for folder in self.folders]
+        return all(file.exists() and read_json(file).get("env_steps") == wanted for file in files)
+
     def _finish(self, moment: Moment, reporter: Reporter) -> list[Run]:
-        """The last evaluation, `evaluation.json`, and the curve."""
+        """The last evaluation, the curve, and `evaluation.json`."""
         runs = []
         results: list[dict[str, Any] | None] = [None] * len(self.seeds)
         if self.evaluator is not None:
@@ -259,13 +298,14 @@ class Session:
                     "stochastic": summary(*pick(explore)),
                 }
         for k, folder in enumerate(self.folders):
+            draw_curves([folder.path], folder.path / "curve.png")
             if results[k] is not None:
                 write_json(folder.path / "evaluation.json", results[k])
-            draw_curves([folder.path], folder.path / "curve.png")
             runs.append(Run(folder.path, results[k]))
-        rate = (moment.env_steps - steps_after(self.plan.algorithm, 0)) / max(moment.seconds, 1e-9)
+        seconds = self.seconds_before + moment.seconds
+        rate = (moment.env_steps - steps_after(self.plan.algorithm, 0)) / max(seconds, 1e-9)
         reporter.say(
-            f"{moment.env_steps:,} steps in {self.seconds_before + moment.seconds:.1f} s ({rate:,.0f} steps/s) after compiling for "
+            f"{moment.env_steps:,} steps in {seconds:.1f} s ({rate:,.0f} steps/s) after compiling for "
             f"{moment.compile_seconds:.1f} s"
         )
         for r in runs:
@@ -314,12 +354,10 @@ def train(
     Returns a `Run`, or a list of them with several seeds. Raises `ValueError` for a request that cannot be met, `Interrupted` after
     Ctrl-C, `NonFinite` where training diverges, `EnvironmentFailure` where the environment fails.
     """
-    if isinstance(num_seeds, bool) or not isinstance(num_seeds, int) or num_seeds < 1:
-        raise ValueError(f"the number of seeds must be at least 1, not {num_seeds}")
+    if isinstance(num_seeds, bool) or not isinstance(num_seeds, int) or not 1 <= num_seeds <= MOST_SEEDS:
+        raise ValueError(f"the number of seeds must be at least 1 and at most {MOST_SEEDS}, not {num_seeds}")
     limits = Limits(stop_at_return, time_limit, checkpoint_every)
-    unknown = [name for name in sinks if name not in SINKS]
-    if unknown:
-        raise ValueError(f"there is no sink {unknown[0]!r}: choose from {', '.join(SINKS)}")
+    require_sinks(sinks)
     make_plan = lambda seed: plan(  # noqa: E731
         algorithm,
         env,
@@ -333,23 +371,44 @@ def train(
         preset=preset,
         data=data,
     )
-    seeds = [seed + k for k in range(num_seeds)]
     first = make_plan(seed)
+    check_budget(None, seed + num_seeds - 1)
+    seeds = [seed + k for k in range(num_seeds)]
+    together = num_seeds > 1 and not hosted(first.algorithm)
+    program = program_of(first, seeds if together else seeds[:1])
+    existed = out is not None and Path(out).exists()
     folders = [
         RunFolder(p)
         for p in new_folders(None if out is None else str(out), first.name, first.config["env"]["id"], seeds)
     ]
-    together = num_seeds > 1 and not hosted(first.algorithm)
     groups = [range(num_seeds)] if together else [[k] for k in range(num_seeds)]
     for k, folder in enumerate(folders):
         group = {"index": k, "folders": [f.path.name for f in folders]} if together else None
         folder.write_config({**first.config, "seed": seeds[k], "group": group, "command": list(command)})
     runs: list[Run] = []
-    for group in groups:
-        part = first if together or not runs else make_plan(seeds[group[0]])
-        session = Session(part, [folders[k] for k in group], [seeds[k] for k in group], limits, sinks, quiet)
-        runs += session.execute(None, callbacks)
+    try:
+        for group in groups:
+            mine = [seeds[k] for k in group]
+            part, program = (make_plan(mine[0]), None) if runs else (first, program)
+            session = Session(part, [folders[k] for k in group], mine, limits, sinks, quiet, program)
+            runs += session.execute(None, callbacks)
+    except (ValueError, EnvironmentFailure, OSError):
+        _leave_nothing(folders, out, existed)
+        raise
     return runs if num_seeds > 1 else runs[0]
+
+
+def _leave_nothing(folders: Sequence[RunFolder], out: str | Path | None, existed: bool) -> None:
+    """Remove the folders of a run that failed before its first checkpoint and its first row: there is nothing to go on from."""
+    if any(folder.iterations() or folder.metrics_file.exists() for folder in folders):
+        return
+    for folder in folders:
+        shutil.rmtree(folder.path, ignore_errors=True)
+    if out is None or len(folders) > 1:
+        with contextlib.suppress(OSError):  # where it holds other runs
+            folders[0].path.parent.rmdir()
+    if existed and out is not None:
+        Path(out).mkdir(exist_ok=True)
 
 
 def resume(
@@ -380,19 +439,46 @@ def resume(
     seeds = [f.config()["seed"] for f in folders]
     limits = Limits(stop_at_return, time_limit, checkpoint_every)
     part = from_config(config, steps=steps, env=env, learner=learner)
+    require_sinks(sinks)
     session = Session(part, folders, seeds, limits, sinks, quiet)
     common = sorted(set.intersection(*(set(f.iterations()) for f in folders)))
     start = common[-1] if common else 0
-    if start >= part.iterations:
+    if start >= part.iterations and session.finished():
         raise ValueError(f"{folder.path} has finished its {config['steps']} steps: give more with --steps to go on")
+    resumed = _restore(session, part, folders, start) if common else None
     for f in folders:
         mine = f.config()
         if steps is not None:
             f.write_config({**mine, "iterations": part.config["iterations"], "steps": part.config["steps"]})
         f.drop_rows_after(start)
-    resumed = _restore(session, part, folders, start) if common else None
+    if steps is not None and not quiet:
+        _say_what_ended(part)
     runs = session.execute(resumed, callbacks)
     return runs if len(runs) > 1 else runs[0]
+
+
+def _say_what_ended(part: Plan) -> None:
+    """Tell whoever extends a run of the schedules that came to their ends in its first budget."""
+    is_schedule = lambda leaf: isinstance(leaf, Schedule)  # noqa: E731
+    named = jax.tree_util.tree_leaves_with_path(part.learner, is_leaf=is_schedule)
+    for path, schedule in named:
+        if is_schedule(schedule) and not isinstance(schedule, Constant):
+            name = jax.tree_util.keystr(path).lstrip(".")
+            print(
+                f"{name} keeps the horizon it began with ({to_text(schedule)}), and stays at its last value after it",
+                file=sys.stderr,
+            )
+
+
+def _load(folder: RunFolder, iteration: int, like: RunState) -> tuple[RunState, dict[str, Any]]:
+    """A checkpoint. There is no silent way back to an older one: who reads the sentence decides."""
+    try:
+        return folder.load_checkpoint(iteration, like)
+    except Damaged as error:
+        older = [i for i in folder.iterations() if i < iteration]
+        then = f"goes on from the one at iteration {older[-1]}" if older else "begins anew"
+        where = folder.checkpoint_folder(iteration)
+        raise Damaged(f"{error}; delete the folder {where} and the run {then}") from error
 
 
 def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: int) -> tuple[State, jax.Array, int]:
@@ -407,7 +493,7 @@ def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: 
             sums,
             jax.ShapeDtypeStruct((), jnp.float32),
         )
-    loaded = [folder.load_checkpoint(start, like) for folder in folders]
+    loaded = [_load(folder, start, like) for folder in folders]
     session.seconds_before = max(about.get("seconds", 0.0) for _, about in loaded)
     states = [state for state, _ in loaded]
     whole = jax.tree.map(lambda *xs: jnp.stack(xs), *states) if session.batched else states[0]

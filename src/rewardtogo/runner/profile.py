@@ -1,0 +1,232 @@
+"""Where the time of a run goes: collection, learning, evaluation (the anatomy of Figure 1.2), each as a program of its own.
+
+The parts are compiled apart, with the shapes, the parameters and the environments of the run, and timed beside the whole iteration,
+round after round, so that whatever else the machine does hits all of them alike; medians of the rounds are reported. A part runs for
+many iterations inside one program, as in training, so that what it costs to call one does not count. Foreign environments are
+also timed from within, in the callback.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core import Algorithm, Learner, PRNGKey, Rollout, State
+from ..envs.gymnasium import GymnasiumEnv, hosted
+from ..loops.collect import begin, collect
+from ..loops.off_policy import OffPolicy, OffPolicyState
+from ..loops.on_policy import OnPolicy
+from .evaluate import Evaluator
+from .evaluate_run import restore
+from .folder import RunFolder
+from .plan import Plan
+
+STRETCH = 0.1
+"""Seconds that a part is run for before the clock is read, about."""
+PATIENCE = 60.0
+"""Seconds after which no further round begins."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Anatomy:
+    """Seconds an iteration: of each part by itself, of the whole, and of the part of collection inside foreign environments."""
+
+    collection: float
+    learning: float
+    evaluation: float
+    whole: float
+    foreign: float | None
+
+    @property
+    def ratio(self) -> float:
+        """The sum of the three parts as a share of the whole: 1 if they are all there is."""
+        return (self.collection + self.learning + self.evaluation) / self.whole
+
+
+def profile(run_path: str | Path, learner: Learner | None = None) -> str:
+    """What share of a run's time collection, learning and evaluation take, as text for people."""
+    config = RunFolder(run_path).config()
+    found = anatomy(run_path, learner=learner)
+    total = found.collection + found.learning + found.evaluation
+    title = f"{config['algorithm']} in {config['env']['id']}"
+    lines = [f"where the time of an iteration goes ({title}):"]
+    for name in ("collection", "learning", "evaluation"):
+        seconds = getattr(found, name)
+        lines.append(f"  {name:<11}{_shown(seconds):>9}{seconds / total:7.0%}")
+    if found.foreign is not None:
+        lines.append(f"  of collection, {found.foreign / found.collection:.0%} are inside the environment's own code")
+    lines.append(f"  together {found.ratio:.0%} of the whole, {_shown(found.whole).strip()}")
+    return "\n".join(lines)
+
+
+def _shown(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.3g} µs"
+
+
+def anatomy(
+    run_path: str | Path,
+    rounds: int = 15,
+    learner: Learner | None = None,
+    timer: Callable[[], float] = time.perf_counter,
+) -> Anatomy:
+    """Time the parts of a run from its last checkpoint on. Nothing in its folder is changed.
+
+    `timer` is the clock; on a CPU that others use as well, `time.process_time` counts what this process gets of it.
+
+    Raises `ValueError` where the run has no checkpoint, or is made of objects that a file cannot hold.
+    """
+    folder = RunFolder(run_path)
+    if not folder.iterations():
+        raise ValueError(f"{folder.path} has no checkpoint to time from: train it with `rtg resume {folder.path}` first")
+    plan, state = restore(folder, folder.iterations()[-1], learner)
+    clock = _Clock(hosted(plan.env), timer)
+    try:
+        return _measure(plan, state, clock, rounds)
+    finally:
+        for env in hosted((plan.env, plan.eval_env)):
+            env.close()
+
+
+class _Clock:
+    """Times calls, and what foreign environments take of them."""
+
+    def __init__(self, envs: list[GymnasiumEnv], timer: Callable[[], float]):
+        self.inside, self.timer = 0.0, timer
+        for env in envs:
+            # The program looks the function up when it is traced, which is after this.
+            vars(env.host)["step"] = self._timed(env.host.step)
+
+    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(words: Any) -> Any:
+            began = self.timer()
+            try:
+                return call(words)
+            finally:
+                self.inside += self.timer() - began
+
+        return timed
+
+    def lap(self, call: Callable[[], Any]) -> tuple[float, float, Any]:
+        """Seconds of a call, seconds of it inside foreign environments, and what it gave."""
+        self.inside, began = 0.0, self.timer()
+        result = jax.block_until_ready(call())
+        return self.timer() - began, self.inside, result
+
+
+def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
+    algorithm, key = plan.algorithm, jax.random.key(0)
+    if clock_needs_actor(algorithm):
+        # A foreign environment is not where the checkpoint left it.
+        state = eqx.tree_at(lambda s: s.actor, state, jax.jit(_begin)(algorithm, state, key))
+    parts = _Parts(algorithm, state, key)
+    evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, plan.config["eval_episodes"])
+
+    def evaluate() -> None:
+        # As in training: without exploring and with. The same key, so that the same episodes are played each time.
+        for explore in (False, True) if evaluator is not None else ():
+            evaluator(algorithm.policy(parts.state, explore), key)
+
+    evaluate()
+    for part in parts.names:
+        parts.advance(part, 1)
+    once = max(clock.lap(lambda: parts.advance("whole", 1))[0], 1e-6)
+    count = int(np.clip(STRETCH / once, 1, plan.config["iterations"]))
+    rows, began = [], time.monotonic()
+    while len(rows) < rounds and (not rows or time.monotonic() - began < PATIENCE):
+        collection, foreign, _ = clock.lap(lambda: parts.advance("collection", count))
+        learning, whole = (clock.lap(lambda p=p: parts.advance(p, count))[0] for p in ("learning", "whole"))
+        evaluation, again = clock.lap(evaluate)[0], clock.lap(evaluate)[0]
+        every = plan.config["eval_every"]
+        rows.append(
+            (collection / count, learning / count, evaluation / every, whole / count + again / every, foreign / count)
+        )
+    *medians, foreign = np.median(rows, axis=0)
+    return Anatomy(*map(float, medians), float(foreign) if hosted(plan.env) else None)
+
+
+def clock_needs_actor(algorithm: Algorithm) -> bool:
+    """Whether the algorithm acts in a foreign environment, where acting has to begin anew."""
+    return isinstance(algorithm, (OnPolicy, OffPolicy)) and bool(hosted(algorithm.env))
+
+
+def _begin(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey) -> State:
+    return begin(algorithm.env, algorithm.policy(state, explore=True), key)
+
+
+class _Parts:
+    """The programs of the parts of an iteration, and the state that they hand on to each other."""
+
+    def __init__(self, algorithm: Algorithm, state: State, key: PRNGKey):
+        self.algorithm, self.state, self.key = algorithm, state, key
+        self.functions: dict[str, Callable] = {"whole": _whole}
+        self.carried: dict[str, Any] = {}
+        rollout: Any = ()
+        if isinstance(algorithm, (OnPolicy, OffPolicy)):
+            _, (rollout, _) = jax.jit(_collection)(algorithm, state, key, ())
+            self.functions |= {"collection": _collection, "learning": _learning}
+        zeros = lambda f: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(f, algorithm, state, key, rollout)[1])  # noqa: E731
+        self.rollout = rollout
+        self.results = {name: zeros(function) for name, function in self.functions.items()}
+        self.programs = {name: jax.jit(_many(function), donate_argnums=(1, 2)) for name, function in self.functions.items()}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be advanced; "collection" and "learning" cost nothing where they are not apart."""
+        return tuple(self.programs)
+
+    def advance(self, name: str, count: int) -> State:
+        """So many iterations of a part."""
+        if name not in self.programs:
+            return self.state if name == "collection" else self.advance("whole", count)
+        self.state, self.results[name] = self.programs[name](
+            self.algorithm, self.state, self.results[name], self.rollout, self.key, count
+        )
+        return self.state
+
+
+def _many(part: Callable) -> Callable:
+    def many(algorithm: Algorithm, state: State, result: Any, rollout: Any, key: PRNGKey, count: int) -> Any:
+        # What a part gives is carried along, so that the compiler leaves none of it out.
+        return jax.lax.fori_loop(
+            0, count, lambda i, loop: part(algorithm, loop[0], jax.random.fold_in(key, i), rollout), (state, result)
+        )
+
+    return many
+
+
+def _whole(algorithm: Algorithm, state: State, key: PRNGKey, rollout: Any) -> tuple[State, Any]:
+    del rollout
+    return algorithm.step(state, key)
+
+
+def _collection(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollout: Any) -> tuple[State, Any]:
+    del rollout
+    policy = algorithm.policy(state, explore=True)
+    keep = algorithm.learner.batch == "sequences"
+    actor, found, episodes = collect(algorithm.env, policy, state.actor, key, algorithm.unroll, keep)
+    return eqx.tree_at(lambda s: s.actor, state, actor), (found, episodes)
+
+
+def _learning(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollout: Rollout) -> tuple[State, Any]:
+    if isinstance(algorithm, OnPolicy):
+        learner, metrics, _ = algorithm.learner.update(state.learner, rollout, key)
+        return eqx.tree_at(lambda s: s.learner, state, learner), metrics
+    replay = algorithm.replay.add(state.replay, rollout.transitions)
+
+    def update(learner: State, key: PRNGKey) -> tuple[State, dict[str, jax.Array]]:
+        sample_key, update_key = jax.random.split(key)
+        if algorithm.learner.batch == "sequences":
+            batch = algorithm.replay.sample_sequences(replay, sample_key, algorithm.batch_size, algorithm.length)
+        else:
+            batch = algorithm.replay.sample(replay, sample_key, algorithm.batch_size)
+        learner, metrics, _ = algorithm.learner.update(learner, batch, update_key)
+        return learner, metrics
+
+    learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(key, algorithm.updates))
+    return OffPolicyState(learner, state.actor, replay), jax.tree.map(jnp.mean, metrics)

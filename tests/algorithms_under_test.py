@@ -1,0 +1,61 @@
+"""The table of algorithms that generic tests run over. A new algorithm adds a row."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import rewardtogo as rtg
+from rewardtogo.core import Algorithm, Environment, Transition, env_spec
+from rewardtogo.data import Dataset
+from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.time_limit import TimeLimit
+from rewardtogo.loops import RandomPolicy, begin
+
+NUM_ENVS = 4
+
+
+def small_env() -> Environment:
+    """CartPole cut after 12 steps: random episodes end both ways."""
+    return TimeLimit(CartPole(), 12)
+
+
+def on_policy(learner: Any, **options: Any) -> Algorithm:
+    return rtg.OnPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, **{"unroll": 8, **options})
+
+
+def off_policy(learner: Any, **options: Any) -> Algorithm:
+    options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
+    return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, rtg.UniformReplay(256), **options)
+
+
+@functools.cache
+def demonstrations() -> Dataset:
+    """48 steps of random play."""
+    env = rtg.vectorize(small_env(), 1)
+    policy = RandomPolicy(env_spec(env))
+    collect = jax.jit(lambda key: rtg.collect(env, policy, begin(env, policy, key), key, 48)[1].transitions)
+    fields = {k: v for k, v in vars(jax.device_get(collect(jax.random.key(3)))).items() if k != "extras"}
+    fields = jax.tree.map(lambda x: np.array(x[:, 0]), fields)
+    fields["truncated"][-1] = not fields["terminated"][-1]
+    return Dataset.of(Transition(**fields, extras={}), env_spec(env))
+
+
+def offline(learner: Any, **options: Any) -> Algorithm:
+    return rtg.Offline(demonstrations(), learner, **{"batch_size": 8, "updates": 2, "length": 4, **options})
+
+
+small, gru, lstm = rtg.MLP(8), rtg.GRU(6, rtg.MLP(5)), rtg.LSTM(6, rtg.MLP(5))
+
+ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
+    "ppo": lambda: on_policy(rtg.PPO(network=small, epochs=2, minibatches=2, normalise_observations=True)),
+    "ppo-gru": lambda: on_policy(rtg.PPO(network=gru, epochs=2, minibatches=2)),
+    "ppo-lstm": lambda: on_policy(rtg.PPO(network=lstm, epochs=1, minibatches=2)),
+    "reinforce": lambda: on_policy(rtg.REINFORCE(network=small, value_updates=2, normalise_observations=True)),
+    "dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2, normalise_observations=True)),
+    "dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, double=True, target_period=1, target_rate=0.1)),
+    "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
+    "bc-gru": lambda: offline(rtg.BC(network=gru)),
+}
