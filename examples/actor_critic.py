@@ -1,6 +1,6 @@
 """A learner of your own in one file: an advantage actor-critic with one gradient step a rollout.
 
-    rtg train actor_critic:A2C CartPole-v1 --num-envs 16 --loop.unroll 16      (from the folder of this file)
+rtg train actor_critic:A2C CartPole-v1 --num-envs 16 --loop.unroll 16      (from the folder of this file)
 """
 
 from typing import Literal

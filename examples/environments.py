@@ -1,7 +1,7 @@
 """Two environments of your own: one for Gymnasium, one compiled with the learner.
 
-    rtg check-env environments:Corridor-v0         (from the folder of this file)
-    rtg train dqn environments:Corridor-v0 --steps 20000
+rtg check-env environments:Corridor-v0         (from the folder of this file)
+rtg train dqn environments:Corridor-v0 --steps 20000
 """
 
 import gymnasium

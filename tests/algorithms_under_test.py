@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import rewardtogo as rtg
@@ -15,6 +16,13 @@ from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
 
 NUM_ENVS = 4
+QUICK = {"xla_backend_optimization_level": 0}
+"""Options for programs that run a few times only: most of a test's time is compilation."""
+
+
+def jit(function: Callable, **options: Any) -> Any:
+    """`jax.jit`, compiled without optimisation."""
+    return jax.jit(function, compiler_options=QUICK, **options)
 
 
 def small_env() -> Environment:
@@ -36,10 +44,11 @@ def demonstrations() -> Dataset:
     """48 steps of random play."""
     env = rtg.vectorize(small_env(), 1)
     policy = RandomPolicy(env_spec(env))
-    collect = jax.jit(lambda key: rtg.collect(env, policy, begin(env, policy, key), key, 48)[1].transitions)
+    collect = jit(lambda key: rtg.collect(env, policy, begin(env, policy, key), key, 48)[1].transitions)
     fields = {k: v for k, v in vars(jax.device_get(collect(jax.random.key(3)))).items() if k != "extras"}
     fields = jax.tree.map(lambda x: np.array(x[:, 0]), fields)
     fields["truncated"][-1] = not fields["terminated"][-1]
+    fields = jax.tree.map(jnp.asarray, fields)
     return Dataset.of(Transition(**fields, extras={}), env_spec(env))
 
 

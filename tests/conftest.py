@@ -16,7 +16,14 @@ import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne}
+OPERATORS = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
 
 
 @pytest.fixture
@@ -30,8 +37,16 @@ def item(request: pytest.FixtureRequest) -> Callable[[str], contextlib.AbstractC
             passed = not math.isnan(value) and OPERATORS[comparison](value, bound)
             folder = os.environ.get("RTG_COVERAGE")
             if folder:
-                row = {"item": name, "test": request.node.nodeid, "value": value, "comparison": comparison, "bound": bound,
-                       "what": what, "passed": bool(passed), "slow": request.node.get_closest_marker("slow") is not None}
+                row = {
+                    "item": name,
+                    "test": request.node.nodeid,
+                    "value": value,
+                    "comparison": comparison,
+                    "bound": bound,
+                    "what": what,
+                    "passed": bool(passed),
+                    "slow": request.node.get_closest_marker("slow") is not None,
+                }
                 with Path(folder, f"{os.getpid()}.jsonl").open("a") as file:
                     file.write(json.dumps(row) + "\n")
             assert passed, f"item {name}: {what or 'measured'} {value:g}, required {comparison} {bound:g}"

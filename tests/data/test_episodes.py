@@ -221,7 +221,9 @@ def cut_file(path: Path) -> None:
         (lambda p: (p / "dataset.json").write_text("{"), "is damaged: it is not JSON"),
         (lambda p: (p / "dataset.json").write_text("[]"), "is not the description of a dataset"),
         (lambda p: rewrite(p, format=99), "format 99, which is newer"),
-        (lambda p: rewrite(p, observation=None), "does not describe spaces and files"),
+        (lambda p: rewrite(p, observation={}), "does not describe spaces and files"),
+        (lambda p: rewrite(p, action={"kind": "discrete", "shape": []}), "does not describe spaces and files"),
+        (lambda p: rewrite(p, files=[{}]), "does not describe spaces and files"),
         (lambda p: rewrite(p, files=[]), "has no episodes"),
         (lambda p: rewrite(p, episodes=4), "should have 4 episodes and 8 steps, and has 3 and 8"),
         (

@@ -49,6 +49,16 @@ def spec_of(observation: spaces.Space, action: spaces.Space) -> EnvSpec:
     return EnvSpec(from_space(observation), from_space(action))
 
 
+def fresh(learner: BC, spec: EnvSpec, key):
+    """A new state, in one program: op by op a network takes seconds."""
+    return jax.jit(lambda learner, key: learner.init(spec, key))(learner, key)
+
+
+@jax.jit
+def update(learner: BC, state, batch: Batch, key):
+    return learner.update(state, batch, key)
+
+
 def batch_of(dataset: Dataset) -> Batch:
     size = dataset.num_steps
     return Batch(dataset.transitions, jnp.arange(size), jnp.ones(size))
@@ -146,7 +156,7 @@ def choices(key):
     """A dataset with three choices, and a learner's state with a policy that is not uniform."""
     spec = spec_of(spaces.Box(-1.0, 1.0, (2,)), spaces.Discrete(3))
     data = steps(jax.random.uniform(key, (20, 2)), jnp.arange(20) % 3, spec)
-    state = BC(network=MLP(4)).init(spec, key)
+    state = fresh(BC(network=MLP(4)), spec, key)
     weight = jax.random.normal(key, state.network.head.linear.weight.shape)
     return data, eqx.tree_at(lambda s: s.network.head.linear.weight, state, weight)
 
@@ -160,7 +170,7 @@ def test_the_loss_is_the_cross_entropy(choices, key):
     entropy = -(p * np.log(p)).sum(1)
     weights = np.linspace(0.0, 2.0, 20)
     batch = eqx.tree_at(lambda b: b.weights, batch_of(data), jnp.asarray(weights, jnp.float32))
-    _, metrics, feedback = BC(network=MLP(4), entropy_cost=0.3).update(state, batch, key)
+    _, metrics, feedback = update(BC(network=MLP(4), entropy_cost=0.3), state, batch, key)
     assert metrics["bc_loss"] == pytest.approx((weights * (cross - 0.3 * entropy)).mean(), rel=1e-5)
     assert metrics["entropy"] == pytest.approx(entropy.mean(), rel=1e-5)
     assert metrics["accuracy"] == pytest.approx((p.argmax(1) == action).mean())
@@ -171,20 +181,20 @@ def test_the_squared_error(key):
     spec = spec_of(spaces.Box(-1.0, 1.0, (2,)), spaces.Box(-4.0, 4.0, (2,)))
     data = steps(jax.random.uniform(key, (20, 2)), jax.random.uniform(key, (20, 2)), spec)
     learner = BC(network=MLP(4), loss="mse")
-    state = learner.init(spec, key)
+    state = fresh(learner, spec, key)
     policy = learner.policy(state, explore=True)
     act = jax.vmap(lambda o, k: policy((), o, k)[1])(data.transitions.observation, jax.random.split(key, 20))
     greedy = learner.policy(state, explore=False)
     assert np.array_equal(act, jax.vmap(lambda o: greedy((), o, key)[1])(data.transitions.observation))
-    _, metrics, _ = learner.update(state, batch_of(data), key)
+    _, metrics, _ = update(learner, state, batch_of(data), key)
     wanted = (np.asarray(act - data.transitions.action, np.float64) ** 2).mean() / 16
     assert metrics["bc_loss"] == pytest.approx(wanted, rel=1e-5) and metrics["mse"] == pytest.approx(wanted, rel=1e-5)
 
 
 def test_weight_decay_is_decoupled(choices, key):
     data, state = choices
-    plain = BC(network=MLP(4), learning_rate=0.01).update(state, batch_of(data), key)[0]
-    decayed = BC(network=MLP(4), learning_rate=0.01, weight_decay=0.5).update(state, batch_of(data), key)[0]
+    plain = update(BC(network=MLP(4), learning_rate=0.01), state, batch_of(data), key)[0]
+    decayed = update(BC(network=MLP(4), learning_rate=0.01, weight_decay=0.5), state, batch_of(data), key)[0]
     before, a, b = (s.network.head.linear.weight for s in (state, plain, decayed))
     assert np.allclose(a - b, 0.01 * 0.5 * before, atol=1e-7)
 
@@ -194,14 +204,14 @@ def test_labels_of_an_expert_who_was_perturbed(choices, key):
     label = (data.transitions.action + 1) % 3
     both = eqx.tree_at(lambda d: d.transitions.extras, data, {EXPERT: label})
     instead = eqx.tree_at(lambda d: d.transitions.action, data, label)
-    update = lambda d: BC(network=MLP(4)).update(state, batch_of(d), key)[1]["bc_loss"]  # noqa: E731
-    assert update(both) == update(instead) != update(data)
+    loss = lambda d: update(BC(network=MLP(4)), state, batch_of(d), key)[1]["bc_loss"]  # noqa: E731
+    assert loss(both) == loss(instead) != loss(data)
 
 
 def test_normalised_observations(choices, key):
     data, _ = choices
     learner = BC(network=MLP(4), normalise_observations=True)
-    state, _, _ = learner.update(learner.init(data.spec, key), batch_of(data), key)
+    state, _, _ = update(learner, fresh(learner, data.spec, key), batch_of(data), key)
     x = data.transitions.observation
     assert np.allclose(state.norm.mean[""], x.mean(0), atol=1e-6) and float(state.norm.count) == 20
     policy = learner.policy(state, explore=False)
@@ -232,7 +242,7 @@ def test_masked_actions_stay_out(key):
     spec = spec_of(space, spaces.Discrete(3))
     data = steps({"action_mask": mask, "x": jax.random.uniform(key, (20, 1))}, jnp.arange(20) % 2 + 1, spec)
     learner = BC(network=MLP(4), entropy_cost=0.1)
-    state, metrics, _ = learner.update(learner.init(spec, key), batch_of(data), key)
+    state, metrics, _ = update(learner, fresh(learner, spec, key), batch_of(data), key)
     assert metrics["bc_loss"] == pytest.approx(0.9 * np.log(2), rel=1e-2)
     one = jax.tree.map(lambda x: x[0], data.transitions.observation)
     assert float(learner.policy(state, explore=False).inspect((), one)["probabilities"][0]) == 0.0
@@ -260,15 +270,21 @@ def test_a_memory_is_learnt(echo, key):
 
 def test_replaying_is_acting(echo, key):
     learner = BC(network=GRU(4, MLP(3)))
-    state = learner.init(echo.spec, key)
+    state = fresh(learner, echo.spec, key)
     state = eqx.tree_at(lambda s: s.network.head.linear.weight, state, jax.random.normal(key, (2, 4)))
     t = jax.tree.map(lambda x: x[:23], echo.transitions)
     policy = learner.policy(state, explore=False)
-    carry, acted = policy.init(key), []
-    for observation, action, done in zip(t.observation, t.action, t.done, strict=True):
+
+    @jax.jit
+    def step(carry, observation, action, done):
         carry, distribution = state.network(carry, observation)
-        acted.append(distribution.log_prob(action))
-        carry = policy.init(key) if done else carry
+        fresh_carry = jax.tree.map(lambda new, old: jnp.where(done, new, old), policy.init(key), carry)
+        return fresh_carry, distribution.log_prob(action)
+
+    carry, acted = policy.init(key), []
+    for inputs in zip(t.observation, t.action, t.done, strict=True):
+        carry, log_prob = step(carry, *inputs)
+        acted.append(log_prob)
     replayed = state.network.along(policy.init(key), t.observation, t.done)
     log_prob = jax.vmap(lambda d, a: d.log_prob(a))(replayed, t.action)
     assert np.allclose(log_prob, jnp.stack(acted), atol=1e-6)

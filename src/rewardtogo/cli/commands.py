@@ -68,10 +68,10 @@ def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
     found = train(
         given.algorithm,
         given.env,
-        steps=_whole(given.steps, file.get("steps")),
+        steps=given.steps if given.steps is not None else _whole("steps", file.get("steps")),
         seed=given.seed,
         num_seeds=given.num_seeds,
-        num_envs=given.num_envs if given.num_envs is not None else file.get("num_envs"),
+        num_envs=given.num_envs if given.num_envs is not None else _whole("num_envs", file.get("num_envs")),
         out=given.out,
         backend=given.backend,
         preset=given.preset,
@@ -139,12 +139,10 @@ def _limits(given: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _whole(steps: float | None, other: Any = None) -> Any:
-    if steps is None:
-        return other
-    if steps == steps and abs(steps) != float("inf") and steps != int(steps):
-        raise RequestError(f"the number of steps must be a whole number, not {steps:g}")
-    return int(steps) if steps == steps and abs(steps) != float("inf") else steps
+def _whole(name: str, value: Any) -> int | None:
+    if value is None or (isinstance(value, int) and not isinstance(value, bool)):
+        return value
+    raise RequestError(f"the entry {name!r} of the configuration file must be a whole number, not {value!r}")
 
 
 def _value(text: Any) -> Any:
@@ -167,7 +165,7 @@ def _report(given: argparse.Namespace, found: Run | list[Run]) -> None:
 def _resume(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     del groups
     learner = _learner_for(given.run, given.learner_class)
-    _report(given, resume(given.run, steps=_whole(given.steps), learner=learner, **_limits(given)))
+    _report(given, resume(given.run, steps=given.steps, learner=learner, **_limits(given)))
 
 
 def _learner_for(run: str, path: str | None) -> Any:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from typing import Any, NoReturn
 from ..catalogue import ALGORITHMS, ENVIRONMENTS, nearest
 
 INTERRUPTED, WRONG = 130, 2
+BACKENDS = ("auto", "jax", "gymnasium")
 MOST_EPISODES = 1_000_000
 
 
@@ -36,6 +38,13 @@ def _whole(text: str) -> int:
         return int(text.replace("_", ""))
     except ValueError:
         raise argparse.ArgumentTypeError(f"it must be a whole number, not {text!r}") from None
+
+
+def _steps(text: str) -> int:
+    steps = _number(text)
+    if not math.isfinite(steps) or steps < 1 or steps != int(steps):
+        raise argparse.ArgumentTypeError(f"the number of steps must be a whole number of at least 1, not {text}")
+    return int(steps)
 
 
 def _seed(text: str) -> int:
@@ -69,7 +78,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
         parser.add_argument("run", metavar="RUN", help="a run folder")
 
     def limits(parser: Parser) -> None:
-        parser.add_argument("--steps", type=_number, help="environment steps (gradient steps offline)")
+        parser.add_argument("--steps", type=_steps, help="environment steps (gradient steps offline)")
         parser.add_argument(
             "--stop-at-return", type=_number, metavar="R", help="stop when an evaluation reaches this return"
         )
@@ -97,7 +106,9 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     p.add_argument("--num-envs", type=_whole, metavar="B", help="environments side by side")
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
-    p.add_argument("--backend", default="auto", help="auto, jax (compiled twin) or gymnasium")
+    p.add_argument(
+        "--backend", choices=BACKENDS, metavar="BACKEND", default="auto", help="auto, jax (compiled twin) or gymnasium"
+    )
     p.add_argument(
         "--preset",
         default="auto",
@@ -126,7 +137,13 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     run_argument(p)
     p.add_argument("--episodes", type=_episodes, default=100, metavar="N")
     p.add_argument("--env", metavar="ENV", help="another environment than the one trained in")
-    p.add_argument("--backend", default=None, help="auto, jax or gymnasium (default: the run's)")
+    p.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        metavar="BACKEND",
+        default=None,
+        help="auto, jax or gymnasium (default: the run's)",
+    )
     p.add_argument("--checkpoint", default="last", metavar="best|last|N")
     p.add_argument("--stochastic", action="store_true", help="sample actions")
     p.add_argument("--seed", type=_seed, default=0)

@@ -165,7 +165,7 @@ def _check(owner: str, field: dataclasses.Field, value: Any) -> None:
         elif isinstance(value, float) or (
             isinstance(value, (jax.Array, np.ndarray, np.generic)) and np.issubdtype(value.dtype, np.number)
         ):
-            values = tuple(np.asarray(value, np.float64).ravel())
+            values = tuple(np.asarray(value, np.float64).ravel().tolist())
         else:
             raise ValueError(f"{owner}.{field.name} must be a number in {span} or a schedule, not {value!r}")
     else:

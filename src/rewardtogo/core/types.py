@@ -63,7 +63,7 @@ class Transition(eqx.Module):
     terminated: Bool[Array, "..."]
     truncated: Bool[Array, "..."]
     next_observation: Observation
-    extras: dict[str, Array]
+    extras: dict[str, PyTree[Array]]
 
     @property
     def done(self) -> Bool[Array, "..."]:

@@ -202,7 +202,9 @@ def load_dataset(path: str | Path) -> Dataset:
         spec = EnvSpec(Spec.from_json(data["observation"]), Spec.from_json(data["action"]))
         files = [(folder / Path(f["name"]).name, int(f["episodes"]), int(f["steps"])) for f in data["files"]]
         extras = {name: (tuple(e["shape"]), np.dtype(e["dtype"])) for name, e in data["extras"].items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        for space in (spec.observation, spec.action):
+            space.to_space()  # raises where the description makes no sense
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, AssertionError) as error:
         raise Damaged(
             f"{folder / 'dataset.json'} is damaged: it does not describe spaces and files ({error})"
         ) from error

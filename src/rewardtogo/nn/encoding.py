@@ -31,7 +31,12 @@ def leaf(observation: Observation, name: str) -> Array:
 def flat_size(spec: Spec) -> int:
     """Length of `flatten_observation`'s result."""
     sizes = {"discrete": lambda s: s.counts[0], "multi_discrete": lambda s: sum(s.counts)}
-    return sum(sizes.get(part.kind, lambda s: s.size)(part) for _, part in input_parts(spec))
+    parts = input_parts(spec)
+    if not parts:
+        raise ValueError(
+            "the observation is an action mask and nothing else: give it at least one part that can be learnt from"
+        )
+    return sum(sizes.get(part.kind, lambda s: s.size)(part) for _, part in parts)
 
 
 def flatten_part(spec: Spec, value: Array) -> Float[Array, "F"]:
@@ -79,12 +84,11 @@ class RunningNorm(eqx.Module):
         total = self.count
         for name, old in self.mean.items():
             batch = leaf(observations, name).reshape(-1, *old.shape)
-            new, total = batch.shape[0], self.count + batch.shape[0]
-            gap = batch.mean(0) - old
+            new, total, centre = batch.shape[0], self.count + batch.shape[0], batch.mean(0)
+            gap = centre - old
             mean[name] = old + gap * (new / total)
-            square[name] = (
-                self.square[name] + ((batch - batch.mean(0)) ** 2).sum(0) + gap**2 * (self.count * new / total)
-            )
+            within = ((batch - centre[None]) ** 2).sum(0)
+            square[name] = self.square[name] + within + gap**2 * (self.count * new / total)
         return RunningNorm(mean, square, total, self.limit)
 
     def __call__(self, observation: Observation) -> Observation:

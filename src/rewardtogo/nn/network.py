@@ -5,6 +5,7 @@ so that plain `jit`, `scan`, `vmap` and `grad` take them as they are. A torso ha
 learner serves both kinds.
 """
 
+import inspect
 import itertools
 from abc import abstractmethod
 from collections.abc import Callable
@@ -231,6 +232,18 @@ def _convolve(x: Float[Array, "1 H W C"], layer: Linear, stride: int) -> Float[A
     return y + layer.bias.reshape(1, 1, 1, -1)
 
 
+def _is_array(leaf: Any) -> bool:
+    # NumPy's too: as a static part it could not be hashed.
+    return isinstance(leaf, (jax.Array, np.ndarray))
+
+
+def _required(function: Callable) -> list[str]:
+    parameters = inspect.signature(function).parameters.values()
+    return [
+        p.name for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+    ]
+
+
 class Custom(Network):
     """Somebody's own network: a built Equinox module, or a function `(spec, key) -> module`. The module maps one observation, as
     the environment gives it, to a feature vector; `flatten_observation` helps with dictionaries and choices.
@@ -243,7 +256,7 @@ class Custom(Network):
 
     def __init__(self, module: Any):
         self.module, self.static = (
-            eqx.partition(module, eqx.is_array) if isinstance(module, eqx.Module) else (None, module)
+            eqx.partition(module, _is_array) if isinstance(module, eqx.Module) else (None, module)
         )
 
     @property
@@ -252,7 +265,15 @@ class Custom(Network):
 
     def build(self, spec: Spec, key: PRNGKey) -> "CustomTorso":
         built = isinstance(self.static, eqx.Module)
+        if not built and len(_required(self.static)) != 2:
+            raise ValueError(
+                f"a function that makes a network takes (spec, key), and {self.static!r} takes ({', '.join(_required(self.static))})"
+            )
         module = eqx.combine(self.module, self.static) if built else self.static(spec, key)
+        if not callable(module):
+            raise ValueError(
+                f"a network must be a module that maps an observation to features, not {type(module).__name__}"
+            )
         try:
             shape = jax.eval_shape(module, spec.zeros())
         except (TypeError, ValueError) as error:
@@ -264,8 +285,8 @@ class Custom(Network):
             raise ValueError(
                 f"the network {type(module).__name__} must map one observation to one feature vector, not to {shape}"
             )
-        arrays, static = eqx.partition(module, eqx.is_array)
-        return CustomTorso(arrays, static, shape.shape[0])
+        arrays, static = eqx.partition(module, _is_array)
+        return CustomTorso(jax.tree.map(jnp.asarray, arrays), static, shape.shape[0])
 
 
 class CustomTorso(Torso):

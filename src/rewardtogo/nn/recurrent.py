@@ -18,7 +18,7 @@ class GRU(Network):
     encoder: Network
 
     def __init__(self, size: int = 64, encoder: Network | None = None):
-        self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
+        self.size, self.encoder = _checked(size), _encoder(encoder)
 
     @property
     def has_memory(self) -> bool:
@@ -35,7 +35,7 @@ class LSTM(Network):
     encoder: Network
 
     def __init__(self, size: int = 64, encoder: Network | None = None):
-        self.size, self.encoder = _checked(size), as_network(MLP(64) if encoder is None else encoder)
+        self.size, self.encoder = _checked(size), _encoder(encoder)
 
     @property
     def has_memory(self) -> bool:
@@ -49,6 +49,15 @@ def _checked(size: int) -> int:
     if size < 1:
         raise ValueError(f"a recurrent network needs at least one unit, not {size}")
     return size
+
+
+def _encoder(encoder: Network | None) -> Network:
+    network = as_network(MLP(64) if encoder is None else encoder)
+    if network.has_memory:
+        raise ValueError(
+            f"a {type(network).__name__} cannot be the encoder of another memory, as its own would be lost: use an MLP or a CNN"
+        )
+    return network
 
 
 def _build(

@@ -79,10 +79,14 @@ def compare(runs: Sequence[str | Path]) -> dict[str, Any]:
     ]
     warnings = [f"{g['algorithm']} in {g['env']}: {g['warning']}" for g in found if g["warning"]]
     for pair in pairs:
-        steps = {g["steps"] for g in found if g["env"] == pair["env"] and g["algorithm"] in (pair["better"], pair["worse"])}
+        steps = {
+            g["steps"] for g in found if g["env"] == pair["env"] and g["algorithm"] in (pair["better"], pair["worse"])
+        }
         if max(steps) > ROUNDING * min(steps):
             said = " and ".join(f"{s:,}" for s in sorted(steps))
-            warnings.append(f"{pair['better']} and {pair['worse']} in {pair['env']} took different numbers of steps, {said}")
+            warnings.append(
+                f"{pair['better']} and {pair['worse']} in {pair['env']} took different numbers of steps, {said}"
+            )
     return {"groups": found, "comparisons": pairs, "warning": "; ".join(warnings) or None}
 
 
@@ -112,14 +116,18 @@ def _warning(members: Sequence[RunFolder], steps: Sequence[int]) -> str | None:
         few = "one seed says" if len(members) == 1 else f"{len(members)} seeds say"
         said.append(f"{few} little about others, train at least {FEW}")
     if len(set(seeds)) < len(seeds):
-        said.append(f"seed {next(s for s in seeds if seeds.count(s) > 1)} is there more than once and is no new evidence")
+        said.append(
+            f"seed {next(s for s in seeds if seeds.count(s) > 1)} is there more than once and is no new evidence"
+        )
     if max(steps) > ROUNDING * min(steps):
         said.append(f"the runs took between {min(steps):,} and {max(steps):,} steps")
     else:
         plain = [_flat({name: config[name] for name in ("learner", "loop", "env")}) for config in configs]
         different = [name for name in plain[0] if any(p.get(name) != plain[0][name] for p in plain)]
         if different:
-            said.append(f"the runs differ in {different[0]}" + (f" and {len(different) - 1} more" if different[1:] else ""))
+            said.append(
+                f"the runs differ in {different[0]}" + (f" and {len(different) - 1} more" if different[1:] else "")
+            )
     return ", ".join(said) or None
 
 
@@ -168,6 +176,4 @@ def _aligned(rows: Sequence[tuple[str, ...]], left: int) -> list[str]:
     """Rows as lines of equal columns, the first `left` of them aligned to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     pad = [str.ljust if i < left else str.rjust for i in range(len(widths))]
-    return [
-        "  ".join(f(cell, width) for f, cell, width in zip(pad, row, widths, strict=True)).rstrip() for row in rows
-    ]
+    return ["  ".join(f(cell, width) for f, cell, width in zip(pad, row, widths, strict=True)).rstrip() for row in rows]

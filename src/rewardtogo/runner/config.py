@@ -23,6 +23,9 @@ from ..ops.schedules import parse_schedule, to_text
 PARTS: dict[str, type] = {c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay)}
 
 
+KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a name"}
+
+
 def resolve(path: str) -> Any:
     """The object that `module:name` names. Raises `ValueError` where there is none."""
     module, _, name = path.partition(":")
@@ -111,6 +114,11 @@ def _value(cls: type, field: dataclasses.Field, value: Any) -> Any:
         return value
     value = _from_text(where, hint, value) if isinstance(value, str) else value
     value = tuple(value) if isinstance(value, list) else value
+    choices = field.metadata.get("choices")
+    if choices and value not in choices:
+        raise ValueError(f"{where} must be one of {', '.join(map(str, choices))}, not {value!r}")
+    if hint in KINDS and not (isinstance(value, hint) and isinstance(value, bool) == (hint is bool)):
+        raise ValueError(f"{where} must be {KINDS[hint]}, not {value!r}")
     if isinstance(value, tuple) and any(isinstance(n, int) and abs(n) >= 2**31 for n in value):
         raise ValueError(f"{where} must be whole numbers less than 2^31, not {' '.join(map(str, value))}")
     return value
@@ -154,7 +162,7 @@ def _from_text(where: str, hint: Any, text: str) -> Any:
         if plain is tuple:
             return tuple(int(item) for item in text.replace(",", " ").split())
     except (ValueError, KeyError):
-        kinds = {bool: "true or false", int: "a whole number", float: "a number", tuple: "whole numbers such as 64 64"}
+        kinds = KINDS | {float: "a number", tuple: "whole numbers such as 64 64"}
         raise ValueError(f"{where} must be {kinds[plain]}, not {text!r}") from None
     return text
 

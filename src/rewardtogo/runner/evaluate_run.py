@@ -82,9 +82,7 @@ def restore(folder: RunFolder, iteration: int, learner: Learner | None = None) -
     plan = from_config(config, steps=None, learner=learner)
     program = Program(plan.algorithm, jax.random.key(config["seed"]), config["row_every"])
     shapes = program.shapes()
-    like = RunState(
-        shapes, jax.eval_shape(program.fresh_sums, shapes), jax.ShapeDtypeStruct((), jnp.float32)
-    )
+    like = RunState(shapes, jax.eval_shape(program.fresh_sums, shapes), jax.ShapeDtypeStruct((), jnp.float32))
     state, _ = folder.load_checkpoint(iteration, like)
     return plan, state.algorithm
 

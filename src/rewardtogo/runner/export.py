@@ -130,7 +130,13 @@ def _description(
             "how": [
                 "import jax.export",
                 f"call = jax.export.deserialize(open({path.name!r}, 'rb').read()).call",
-                *(["memory = [numpy.full(m.shape, m.initial, m.dtype) for each m of memory]  # when an episode starts"] if memory else []),
+                *(
+                    [
+                        "memory = [numpy.full(m.shape, m.initial, m.dtype) for each m of memory]  # when an episode starts"
+                    ]
+                    if memory
+                    else []
+                ),
                 call,
             ],
             "observation": parts or leaf(observation),

@@ -5,6 +5,7 @@ refused, and StableHLO holds those.
 """
 
 import importlib
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -96,15 +97,21 @@ def _value(onnx: Any, name: str, spec: Spec) -> Any:
 
 def _dense(policy: Policy) -> tuple[MLPTorso, Linear]:
     """The dense layers that choose the action, and the last one."""
-    torso: Torso | None = None
-    if isinstance(policy, ActorCriticPolicy):
-        torso, head = policy.network.actor, policy.network.head.linear
-    elif isinstance(policy, GreedyPolicy):
-        torso, head = policy.network.torso, policy.network.head
+    torso, head = _network(policy)
     if not isinstance(torso, MLPTorso):
-        what = type(policy if torso is None else torso).__name__
-        raise ValueError(f"ONNX is written for networks of dense layers, not for a {what}: use --format stablehlo")
+        raise ValueError(
+            f"ONNX is written for networks of dense layers, not for a {type(torso).__name__}: use --format stablehlo"
+        )
     return torso, head
+
+
+def _network(policy: Policy) -> tuple[Torso, Linear]:
+    """What chooses the action: features, and the last layer."""
+    if isinstance(policy, ActorCriticPolicy):
+        return policy.network.actor, policy.network.head.linear
+    if isinstance(policy, GreedyPolicy):
+        return policy.network.torso, policy.network.head
+    raise ValueError(f"ONNX cannot be written for a {type(policy).__name__}: use --format stablehlo")
 
 
 def _flat(graph: _Graph, spec: Spec, norm: RunningNorm | None) -> str:
@@ -158,7 +165,7 @@ def _action(graph: _Graph, spec: Spec, out: str, masked: bool) -> None:
         out = graph.add("Where", allowed, out, graph.constant(np.finfo(np.float32).min))
     edges = np.cumsum([0, *spec.counts])
     digits = []
-    for first, last in zip(edges, edges[1:]):  # noqa: B905
+    for first, last in itertools.pairwise(edges):
         span = [graph.constant([v], np.int64) for v in (first, last, 1)]
         digits.append(graph.add("ArgMax", graph.add("Slice", out, *span), axis=1, keepdims=1))
     digits = digits[0] if len(digits) == 1 else graph.add("Concat", *digits, axis=1)

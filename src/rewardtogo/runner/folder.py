@@ -182,7 +182,7 @@ class RunFolder:
         """Remove the rows that a resumed run will write again, and a half-written last line."""
         if not self.metrics_file.exists():
             return
-        lines = self.metrics_file.read_text(encoding="utf-8").splitlines()
+        lines = self._table().splitlines()
         if not lines:
             self.metrics_file.unlink()
             return
@@ -191,12 +191,17 @@ class RunFolder:
         kept = [line for line in whole if int(line.split(",")[0]) <= iteration]
         write_text(self.metrics_file, "\n".join([lines[0], *kept]) + "\n")
 
+    def _table(self) -> str:
+        try:
+            return self.metrics_file.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise Damaged(f"{self.metrics_file} is damaged: it is not text") from error
+
     def metrics(self) -> dict[str, np.ndarray]:
         """The columns of `metrics.csv` as arrays, NaN where a cell is empty. Raises `Damaged` where there is no such table."""
         if not self.metrics_file.exists():
             raise Damaged(f"{self.path} has no metrics.csv: the run has not finished its first row")
-        with self.metrics_file.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file))
+        rows = list(csv.reader(self._table().splitlines()))
         if not rows or "env_steps" not in rows[0] or "return_mean" not in rows[0]:
             raise Damaged(f"{self.metrics_file} is damaged: it has no columns env_steps and return_mean")
         body = [row for row in rows[1:] if len(row) == len(rows[0])]

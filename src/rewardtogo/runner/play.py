@@ -109,7 +109,8 @@ def _no_picture(name: str, error: BaseException | None) -> ValueError:
 
 def _frame(env: gymnasium.Env, name: str) -> np.ndarray:
     try:
-        picture: Any = env.render()
+        # Gymnasium warns where there is no such mode, which is said below.
+        picture: Any = env.render() if env.render_mode in ("rgb_array", "rgb_array_list") else None
     except (gymnasium.error.Error, ImportError, NotImplementedError) as error:
         raise _no_picture(name, error) from error
     picture = picture[-1] if isinstance(picture, list) and picture else picture
@@ -118,9 +119,7 @@ def _frame(env: gymnasium.Env, name: str) -> np.ndarray:
     return picture.astype(np.uint8)
 
 
-def _episode(
-    env: gymnasium.Env, policy: LoadedPolicy, seed: int, stochastic: bool, film: "_Film"
-) -> tuple[float, int]:
+def _episode(env: gymnasium.Env, policy: LoadedPolicy, seed: int, stochastic: bool, film: "_Film") -> tuple[float, int]:
     name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
     policy.reset(seed)
     observation, info = env.reset(seed=seed)

@@ -165,4 +165,3 @@ def _dress(axes: Axes, folders: Sequence[RunFolder], title: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     if axes.lines:
         axes.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
-

@@ -66,7 +66,13 @@ def profile(run_path: str | Path, learner: Learner | None = None) -> str:
 
 
 def _shown(seconds: float) -> str:
-    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.3g} µs"
+    return (
+        f"{seconds:.3g} s"
+        if seconds >= 1
+        else f"{1e3 * seconds:.3g} ms"
+        if seconds >= 1e-3
+        else f"{1e6 * seconds:.3g} µs"
+    )
 
 
 def anatomy(
@@ -83,7 +89,9 @@ def anatomy(
     """
     folder = RunFolder(run_path)
     if not folder.iterations():
-        raise ValueError(f"{folder.path} has no checkpoint to time from: train it with `rtg resume {folder.path}` first")
+        raise ValueError(
+            f"{folder.path} has no checkpoint to time from: train it with `rtg resume {folder.path}` first"
+        )
     plan, state = restore(folder, folder.iterations()[-1], learner)
     clock = _Clock(hosted(plan.env), timer)
     try:
@@ -121,22 +129,24 @@ class _Clock:
 
 def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
     algorithm, key = plan.algorithm, jax.random.key(0)
-    if clock_needs_actor(algorithm):
+    if _acts_outside(algorithm):
         # A foreign environment is not where the checkpoint left it.
         state = eqx.tree_at(lambda s: s.actor, state, jax.jit(_begin)(algorithm, state, key))
     parts = _Parts(algorithm, state, key)
     evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, plan.config["eval_episodes"])
+    # Copies, since the programs below reuse the memory of the state; the same ones and the same key, so that evaluation plays
+    # the same episodes each time.
+    policies = [jax.tree.map(jnp.copy, algorithm.policy(state, explore)) for explore in (False, True)]
 
     def evaluate() -> None:
-        # As in training: without exploring and with. The same key, so that the same episodes are played each time.
-        for explore in (False, True) if evaluator is not None else ():
-            evaluator(algorithm.policy(parts.state, explore), key)
+        if evaluator is not None:
+            for policy in policies:
+                evaluator(policy, key)
 
     evaluate()
     for part in parts.names:
         parts.advance(part, 1)
-    once = max(clock.lap(lambda: parts.advance("whole", 1))[0], 1e-6)
-    count = int(np.clip(STRETCH / once, 1, plan.config["iterations"]))
+    count = _stretch(lambda count: clock.lap(lambda: parts.advance("whole", count))[0], plan.config["iterations"])
     rows, began = [], time.monotonic()
     while len(rows) < rounds and (not rows or time.monotonic() - began < PATIENCE):
         collection, foreign, _ = clock.lap(lambda: parts.advance("collection", count))
@@ -146,11 +156,19 @@ def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
         rows.append(
             (collection / count, learning / count, evaluation / every, whole / count + again / every, foreign / count)
         )
-    *medians, foreign = np.median(rows, axis=0)
-    return Anatomy(*map(float, medians), float(foreign) if hosted(plan.env) else None)
+    collection, learning, evaluation, whole, foreign = np.median(rows, axis=0).tolist()
+    return Anatomy(collection, learning, evaluation, whole, foreign if hosted(plan.env) else None)
 
 
-def clock_needs_actor(algorithm: Algorithm) -> bool:
+def _stretch(seconds: Callable[[int], float], most: int) -> int:
+    """Iterations that take about `STRETCH`, found by doubling, since a call by itself costs as much as many iterations."""
+    count = 1
+    while count < most and seconds(count) < STRETCH / 2:
+        count = min(2 * count, most)
+    return count
+
+
+def _acts_outside(algorithm: Algorithm) -> bool:
     """Whether the algorithm acts in a foreign environment, where acting has to begin anew."""
     return isinstance(algorithm, (OnPolicy, OffPolicy)) and bool(hosted(algorithm.env))
 
@@ -165,15 +183,20 @@ class _Parts:
     def __init__(self, algorithm: Algorithm, state: State, key: PRNGKey):
         self.algorithm, self.state, self.key = algorithm, state, key
         self.functions: dict[str, Callable] = {"whole": _whole}
-        self.carried: dict[str, Any] = {}
         rollout: Any = ()
         if isinstance(algorithm, (OnPolicy, OffPolicy)):
-            _, (rollout, _) = jax.jit(_collection)(algorithm, state, key, ())
+            self.state, (rollout, _) = jax.jit(_collection)(algorithm, state, key, ())
             self.functions |= {"collection": _collection, "learning": _learning}
-        zeros = lambda f: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(f, algorithm, state, key, rollout)[1])  # noqa: E731
         self.rollout = rollout
-        self.results = {name: zeros(function) for name, function in self.functions.items()}
-        self.programs = {name: jax.jit(_many(function), donate_argnums=(1, 2)) for name, function in self.functions.items()}
+        self.results = {name: self._nothing(function) for name, function in self.functions.items()}
+        self.programs = {
+            name: jax.jit(_many(function), donate_argnums=(1, 2)) for name, function in self.functions.items()
+        }
+
+    def _nothing(self, part: Callable) -> Any:
+        """What a part gives, before it has given anything."""
+        shapes = jax.eval_shape(part, self.algorithm, self.state, self.key, self.rollout)[1]
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -192,10 +215,13 @@ class _Parts:
 
 def _many(part: Callable) -> Callable:
     def many(algorithm: Algorithm, state: State, result: Any, rollout: Any, key: PRNGKey, count: int) -> Any:
-        # What a part gives is carried along, so that the compiler leaves none of it out.
-        return jax.lax.fori_loop(
-            0, count, lambda i, loop: part(algorithm, loop[0], jax.random.fold_in(key, i), rollout), (state, result)
-        )
+        def once(i: jax.Array, loop: tuple[State, Any]) -> tuple[State, Any]:
+            # What a part gives is carried along, so that the compiler leaves none of it out; and parameters and data look
+            # new in each iteration, as they are in training, so that it does not prepare them once for all.
+            state, rollout_now, at = jax.lax.optimization_barrier((loop[0], rollout, i))
+            return part(algorithm, state, jax.random.fold_in(key, at), rollout_now)
+
+        return jax.lax.fori_loop(0, count, once, (state, result))
 
     return many
 
@@ -228,5 +254,9 @@ def _learning(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollo
         learner, metrics, _ = algorithm.learner.update(learner, batch, update_key)
         return learner, metrics
 
-    learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(key, algorithm.updates))
-    return OffPolicyState(learner, state.actor, replay), jax.tree.map(jnp.mean, metrics)
+    if algorithm.updates == 1:
+        learner, metrics = update(state.learner, key)
+    else:
+        learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(key, algorithm.updates))
+        metrics = jax.tree.map(jnp.mean, metrics)
+    return OffPolicyState(learner, state.actor, replay), metrics

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import shutil
 import signal
 import sys
@@ -376,7 +377,7 @@ def train(
     seeds = [seed + k for k in range(num_seeds)]
     together = num_seeds > 1 and not hosted(first.algorithm)
     program = program_of(first, seeds if together else seeds[:1])
-    existed = out is not None and Path(out).exists()
+    existed = out is not None and os.path.exists(out)
     folders = [
         RunFolder(p)
         for p in new_folders(None if out is None else str(out), first.name, first.config["env"]["id"], seeds)
@@ -447,10 +448,9 @@ def resume(
         raise ValueError(f"{folder.path} has finished its {config['steps']} steps: give more with --steps to go on")
     resumed = _restore(session, part, folders, start) if common else None
     for f in folders:
-        mine = f.config()
-        if steps is not None:
-            f.write_config({**mine, "iterations": part.config["iterations"], "steps": part.config["steps"]})
         f.drop_rows_after(start)
+    for f in folders if steps is not None else ():
+        f.write_config({**f.config(), "iterations": part.config["iterations"], "steps": part.config["steps"]})
     if steps is not None and not quiet:
         _say_what_ended(part)
     runs = session.execute(resumed, callbacks)

@@ -185,6 +185,8 @@ class DQN(Learner):
                 (standard(t.observation), standard(t.next_observation)),
             )
 
+        by_sample = lambda x: x if x.ndim == 1 else x.mean(0)  # noqa: E731
+
         def loss(network: QNetwork) -> tuple[Array, tuple[Array, Array]]:
             q, following = network.along(t)
             _, target_following = state.target.along(t)
@@ -198,7 +200,7 @@ class DQN(Learner):
             y = jax.lax.stop_gradient(value_of(t.reward, discount, target_following, following))
             chosen = jnp.take_along_axis(q, t.action[..., None], -1)[..., 0]
             error = chosen - y
-            return (batch.weights * huber(error, now.huber)).mean(), (chosen, error)
+            return (batch.weights * by_sample(huber(error, now.huber))).mean(), (chosen, error)
 
         (value, (chosen, error)), gradient = jax.value_and_grad(loss, has_aux=True)(state.network)
         network, optimiser = now._optimiser().step(state.network, gradient, state.optimiser)
@@ -214,8 +216,7 @@ class DQN(Learner):
             "grad_norm": global_norm(gradient),
             "epsilon": now.epsilon,
         }
-        priorities = jnp.abs(error) if error.ndim == 1 else jnp.abs(error).mean(0)
-        return DQNState(network, target, optimiser, norm, updates), metrics, priorities
+        return DQNState(network, target, optimiser, norm, updates), metrics, by_sample(jnp.abs(error))
 
     def _optimiser(self) -> Adam:
         return Adam(self.learning_rate, self.max_grad_norm)

@@ -1,0 +1,184 @@
+"""One measurement of this library in a process of its own; prints one JSON line."""
+
+import argparse
+import json
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import rewardtogo as rtg
+from rewardtogo.cli.commands import use_cache
+from rewardtogo.runner.engine import Program
+
+ENV = "CartPole-v1"
+PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"sizes": [64, 64]}}
+DQN: dict[str, Any] = {"learning_rate": 1e-3, "target_period": 250}
+OFF: dict[str, Any] = {"batch_size": 64, "unroll": 4, "updates": 1, "warm_up": 1000, "replay": {"capacity": 100_000}}
+
+
+def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
+    """The algorithm of a row, put together."""
+    if name == "ppo":
+        learner = rtg.PPO(learning_rate=3e-4, epochs=4, minibatches=4, network=rtg.MLP(64, 64))
+        whole = rtg.OnPolicy(rtg.make(ENV, num_envs=8), learner, unroll=128)
+    else:
+        replay = rtg.UniformReplay(capacity)
+        learner = rtg.DQN(learning_rate=1e-3, target_period=250)
+        whole = rtg.OffPolicy(rtg.make(ENV, num_envs=1), learner, replay, batch_size=64, unroll=4, warm_up=1000)
+    return whole.with_horizon(10_000)
+
+
+def train(given: argparse.Namespace) -> dict[str, Any]:
+    """A whole run with its folder, metrics and evaluations: steps a second as the library itself reports them."""
+    seen: list[rtg.Moment] = []
+    on_policy = given.name == "ppo"
+    with tempfile.TemporaryDirectory() as folder:
+        run = rtg.train(
+            given.name,
+            ENV,
+            steps=given.steps + (0 if on_policy else OFF["warm_up"]),
+            seed=given.seed,
+            num_envs=8 if on_policy else 1,
+            out=f"{folder}/run",
+            backend=given.backend,
+            preset="none",
+            learner=PPO if on_policy else DQN,
+            loop={"unroll": 128} if on_policy else OFF,
+            callbacks=[lambda moment: seen.__setitem__(slice(None), [moment])],
+            quiet=True,
+        )
+    last = seen[0]
+    steps = last.env_steps - last.algorithm.initial_steps
+    return {
+        "rate": steps / last.seconds,
+        "return": run.evaluation["return_mean"],
+        "compile_seconds": last.compile_seconds,
+    }
+
+
+def clock(program: Program, iterations: int) -> Callable[[], float]:
+    """A function that goes on training and says how long an iteration took; compiled and warm."""
+    state = program.init()
+    state, sums, _ = program.advance(state, program.fresh_sums(state), 0, 2)
+    now = [state, sums, 2]
+
+    def lap() -> float:
+        started = time.perf_counter()
+        now[0], now[1], _ = program.advance(now[0], now[1], now[2], now[2] + iterations)
+        now[2] += iterations
+        return (time.perf_counter() - started) / iterations
+
+    return lap
+
+
+def seeds(given: argparse.Namespace) -> dict[str, Any]:
+    """64 seeds in one program against 64 runs of one seed, one after another."""
+    number = 64
+    whole = algorithm(given.name)
+    keys = jax.vmap(jax.random.key)(np.arange(number))
+    few, many = (4, 60) if given.name == "ppo" else (100, 2000)
+    rows = 10**6
+    together = clock(Program(whole, keys, rows), few)
+    alone = clock(Program(whole, keys[0], rows), many)
+    # In turns, so that a busy moment of the machine hits both.
+    laps = [(together(), alone()) for _ in range(given.repeats)]
+    times = [statistics.median(side) for side in zip(*laps, strict=True)]
+    return {"together": times[0], "alone": number * times[1], "ratio": times[0] / (number * times[1])}
+
+
+def door(given: argparse.Namespace) -> dict[str, Any]:
+    """Milliseconds of one step of 8 environments: through the door inside a compiled loop, and in a plain Python loop."""
+    import gymnasium
+    from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+    steps, number = 2000, 8
+    env = rtg.GymnasiumEnv(ENV, number)
+    make = lambda: gymnasium.make(ENV, disable_env_checker=True)  # noqa: E731
+    plain = SyncVectorEnv([make] * number, autoreset_mode=AutoresetMode.DISABLED)
+
+    @jax.jit
+    def program(key: jax.Array) -> Any:
+        keys = jax.random.split(key, number)
+
+        def body(i: jax.Array, loop: tuple) -> tuple:
+            state, _, total = loop
+            state, step = env.step(state, jax.numpy.full(number, i % 2, jax.numpy.int32), keys)
+            return state, step.observation, total + step.reward.sum()
+
+        return jax.lax.fori_loop(0, steps, body, (*env.reset(keys), 0.0))
+
+    def through() -> float:
+        started = time.perf_counter()
+        jax.block_until_ready(program(jax.random.key(given.seed)))
+        return 1e3 * (time.perf_counter() - started) / steps
+
+    def outside() -> float:
+        plain.reset(seed=given.seed)
+        started = time.perf_counter()
+        for i in range(steps):
+            _, _, terminated, truncated, _ = plain.step(np.full(number, i % 2))
+            done = terminated | truncated
+            if done.any():
+                plain.reset(options={"reset_mask": done})
+        return 1e3 * (time.perf_counter() - started) / steps
+
+    through()
+    laps = [(through(), outside()) for _ in range(given.repeats)]
+    # The difference of neighbours: the load of a shared machine moves slowly.
+    return {
+        "through": statistics.median(a for a, _ in laps),
+        "plain": statistics.median(b for _, b in laps),
+        "door": statistics.median(a - b for a, b in laps),
+    }
+
+
+def start(given: argparse.Namespace) -> dict[str, Any]:
+    """Seconds of `init` and of the first chunk in this fresh process, with the command's cache."""
+    use_cache()
+    program = Program(algorithm(given.name), jax.random.key(given.seed), 1)
+    jax.block_until_ready(program.key)
+    began = time.perf_counter()
+    state = program.init()
+    initial = time.perf_counter() - began
+    program.advance(state, program.fresh_sums(state), 0, 1)
+    return {"init": initial, "seconds": time.perf_counter() - began}
+
+
+def memory(given: argparse.Namespace) -> dict[str, Any]:
+    """Peak memory of a run with a replay of a million transitions, and how much of it is arrays."""
+    state, _ = rtg.run(algorithm("dqn", capacity=1_000_000), jax.random.key(given.seed), given.steps // 4)
+    arrays = sum(
+        (jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x).nbytes
+        for x in jax.tree.leaves(state)
+    )
+    # Linux counts in kilobytes, macOS in bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    return {"peak": peak / 1e6, "arrays": arrays / 1e6, "beside": (peak - arrays) / 1e6}
+
+
+TASKS = {"train": train, "seeds": seeds, "door": door, "start": start, "memory": memory}
+
+
+def main() -> None:
+    """Measure one thing."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("task", choices=TASKS)
+    parser.add_argument("name", nargs="?", choices=["ppo", "dqn"], default="ppo")
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--backend", default="jax")
+    given = parser.parse_args()
+    print(json.dumps(TASKS[given.task](given)))
+
+
+if __name__ == "__main__":
+    main()

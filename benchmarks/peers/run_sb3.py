@@ -1,0 +1,79 @@
+"""One run of Stable-Baselines3, or of SBX, which has the same interface; prints one JSON line."""
+
+import argparse
+import json
+import time
+
+
+def activation(library: str, name: str):
+    """The function in the library's own framework."""
+    if library == "sbx":
+        import jax
+
+        return {"tanh": jax.numpy.tanh, "relu": jax.nn.relu}[name]
+    import torch
+
+    return {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[name]
+
+
+def make_model(library: str, task: str, seed: int):
+    """The model, and the steps of it that are not measured: compilation, warm-up of the replay."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    if library == "sbx":
+        from sbx import DQN, PPO
+    else:
+        from stable_baselines3 import DQN, PPO
+    common = {"seed": seed, "device": "cpu"}
+    envs = lambda number: make_vec_env("CartPole-v1", number, seed=seed)  # noqa: E731
+    layers = {"net_arch": [64, 64], "activation_fn": activation(library, "relu" if task == "dqn" else "tanh")}
+    if task == "ppo":
+        model = PPO(
+            "MlpPolicy", envs(8), n_steps=128, n_epochs=4, batch_size=256, learning_rate=3e-4, ent_coef=0.0,
+            policy_kwargs=layers, **common,
+        )  # fmt: skip
+        return model, 2 * 1024
+    if task == "zoo":
+        decay = lambda start: lambda left: start * left  # noqa: E731
+        model = PPO(
+            "MlpPolicy", envs(8), n_steps=32, n_epochs=20, batch_size=256, gamma=0.98, gae_lambda=0.8, ent_coef=0.0,
+            learning_rate=decay(0.001), clip_range=decay(0.2), policy_kwargs=layers, **common,
+        )  # fmt: skip
+        return model, 0
+    model = DQN(
+        "MlpPolicy", envs(1), buffer_size=100_000, batch_size=64, train_freq=4, gradient_steps=1, learning_starts=1000,
+        learning_rate=1e-3, target_update_interval=1000, exploration_fraction=0.2, exploration_final_eps=0.05,
+        policy_kwargs=layers, **common,
+    )  # fmt: skip
+    return model, 1200
+
+
+def main() -> None:
+    """Train, measure, evaluate."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("task", choices=["ppo", "dqn", "zoo"])
+    parser.add_argument("--library", choices=["sb3", "sbx"], default="sb3")
+    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--began", type=float, help="when the process was started, in seconds since the epoch")
+    parser.add_argument("--save", help="where the model is saved")
+    given = parser.parse_args()
+    model, before = make_model(given.library, given.task, given.seed)
+    if before:
+        model.learn(before)
+    first, started = model.num_timesteps, time.perf_counter()
+    model.learn(given.steps, reset_num_timesteps=not before)
+    seconds = time.perf_counter() - started
+    if given.save:
+        model.save(given.save)
+    # Evaluation comes after the clock of the whole process has stopped.
+    whole = time.time() - given.began if given.began else None
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    mean, _ = evaluate_policy(model, model.get_env(), n_eval_episodes=20, deterministic=True)
+    rate = (model.num_timesteps - (first if before else 0)) / seconds
+    print(json.dumps({"rate": rate, "return": float(mean), "process_seconds": whole}))
+
+
+if __name__ == "__main__":
+    main()
