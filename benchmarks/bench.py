@@ -332,7 +332,7 @@ def start(size: "Size") -> list[Row]:
     limits = {"ppo": 6, "ppo, cached": 1.6, "dqn": 4, "dqn, cached": 1.1}
     title = lambda name: (
         f"`init` and first chunk in a fresh process, {name.replace('ppo', 'PPO').replace('dqn', 'DQN')}"
-    )  # noqa: E731
+    )
     rows = [limit(title(name), found[name], "seconds", most, "s") for name, most in limits.items()]
     return [*rows, limit("`rtg --help`", helped, "process_seconds", 0.5, "s")]
 

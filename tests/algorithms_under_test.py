@@ -4,12 +4,13 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import rewardtogo as rtg
-from rewardtogo.core import Algorithm, Environment, Transition, env_spec
+from rewardtogo.core import MASK, Algorithm, Environment, Timestep, Transition, env_spec
 from rewardtogo.data import Dataset
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.time_limit import TimeLimit
@@ -68,3 +69,37 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),
 }
+
+
+class MaskedProbe(Environment):
+    """Three actions of which one or two are allowed, others from step to step; a forbidden one costs 100. Cut after 5 steps."""
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        return spaces.Dict({"x": spaces.Box(-1, 1, (1,), np.float32), MASK: spaces.MultiBinary(3)})
+
+    @property
+    def action_space(self) -> spaces.Discrete:
+        return spaces.Discrete(3)
+
+    def reset(self, key: jax.Array) -> tuple[Any, Any]:
+        del key
+        return (jnp.zeros((), jnp.int32), self._mask(jnp.zeros((), jnp.int32))), self._observe(jnp.zeros((), jnp.int32))
+
+    def step(self, state: Any, action: Any, key: jax.Array) -> tuple[Any, Timestep]:
+        del key
+        taken, mask = state
+        reward = jnp.where(mask[action] > 0, 1.0, -100.0)
+        taken = taken + 1
+        observation = self._observe(taken)
+        truncated = taken >= 5
+        return (taken, self._mask(taken)), Timestep(
+            observation, reward, jnp.zeros((), bool), truncated, observation, {}
+        )
+
+    def _mask(self, taken: jax.Array) -> jax.Array:
+        masks = jnp.asarray([[1, 0, 0], [0, 1, 1], [0, 0, 1]], jnp.int8)
+        return masks[taken % 3]
+
+    def _observe(self, taken: jax.Array) -> dict[str, jax.Array]:
+        return {"x": jnp.ones(1), MASK: self._mask(taken)}

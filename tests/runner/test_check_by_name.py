@@ -2,13 +2,14 @@
 
 import gymnasium
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.vectorize import vectorize
 from rewardtogo.runner.check import check_by_name
 
 
-class Endless(gymnasium.envs.classic_control.PendulumEnv):
+class Endless(PendulumEnv):
     """No time limit."""
 
 

@@ -9,7 +9,8 @@ from scipy import stats
 from rewardtogo.runner.compare import compare, final_return, interquartile_mean, probability_of_improvement, table
 from rewardtogo.runner.folder import RunFolder
 
-CONFIG = {"loop": {}, "row_every": 1, "eval_every": 1, "iterations": 1}
+CONFIG = {"row_every": 1, "eval_every": 1, "eval_episodes": 20, "iterations": 1, "loop": {"class": "Loop"}}
+ENV = {"backend": "jax", "num_envs": 1, "kwargs": {}, "by_name": True}
 
 
 @pytest.fixture
@@ -17,7 +18,13 @@ def make_run(tmp_path):
     def make(algorithm, score, seed=0, env="CartPole-v1", steps=1000, learner=None):
         path = tmp_path / f"run-{len(list(tmp_path.iterdir()))}"
         path.mkdir()
-        config = {"algorithm": algorithm, "env": {"id": env}, "seed": seed, "steps": steps, "learner": learner or {}}
+        config = {
+            "algorithm": algorithm,
+            "env": {"id": env, **ENV},
+            "seed": seed,
+            "steps": steps,
+            "learner": learner or {},
+        }
         RunFolder(path).write_config({**CONFIG, **config})
         (path / "evaluation.json").write_text(json.dumps({"return_mean": score, "env_steps": steps}))
         return path

@@ -16,7 +16,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-
 Module = TypeVar("Module")
 
 

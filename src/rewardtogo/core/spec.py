@@ -99,12 +99,12 @@ class Spec:
         return value.astype(self.dtype)
 
     def clip(self, value: PyTree[Array]) -> PyTree[Array]:
-        """The nearest valid element: boxes are clipped to their bounds, the rest is valid already."""
+        """The nearest valid element (or batch of them): boxes are clipped to their bounds, the rest is valid already."""
         if self.kind == "dict":
             return {name: part.clip(value[name]) for name, part in self.parts}
         if self.kind != "box" or (np.all(np.isinf(self.low)) and np.all(np.isinf(self.high))):
             return value
-        low, high = self.bounds()
+        low, high = (bound.reshape((1,) * (value.ndim - bound.ndim) + bound.shape) for bound in self.bounds())
         return jnp.clip(value, jnp.asarray(low), jnp.asarray(high))
 
     def to_space(self) -> spaces.Space:

@@ -31,7 +31,7 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """The mean of what is left when the lowest and the highest floor(n/4) of n values are left out."""
     ordered = np.sort(np.asarray(values, np.float64), axis)
     count = ordered.shape[axis]
-    return np.take(ordered, range(count // 4, count - count // 4), axis).mean(axis)
+    return np.asarray(np.take(ordered, range(count // 4, count - count // 4), axis).mean(axis))
 
 
 def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> tuple[float, tuple[float, float]]:

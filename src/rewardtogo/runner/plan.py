@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import platform
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -86,14 +87,14 @@ def plan(
             else ("on_policy" if inner.batch == "rollout" else "off_policy")
         )
         if data is not None:
-            kind = "offline"
+            kind, options = "offline", loop or {}
         cls = resolve(LOOPS[kind])
         if kind == "offline":
             if data is None:
                 raise ValueError(
                     f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
                 )
-            dataset = load_dataset(data) if isinstance(data, str) else data
+            dataset = load_dataset(data) if isinstance(data, (str, Path)) else data
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
             if vector_env is not None:
                 require_spec(dataset.spec, env_spec(vector_env), "the data")
@@ -125,7 +126,7 @@ def plan(
         },
         "learner": describe(inner) if inner is not None else {},
         "loop": describe(whole),
-        "data": data if isinstance(data, str) else None,
+        "data": str(data) if isinstance(data, (str, Path)) else None,
         "seed": seed,
         "steps": steps_after(whole, iterations),
         "iterations": iterations,

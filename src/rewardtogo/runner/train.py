@@ -383,11 +383,11 @@ def train(
         for p in new_folders(None if out is None else str(out), first.name, first.config["env"]["id"], seeds)
     ]
     groups = [range(num_seeds)] if together else [[k] for k in range(num_seeds)]
-    for k, folder in enumerate(folders):
-        group = {"index": k, "folders": [f.path.name for f in folders]} if together else None
-        folder.write_config({**first.config, "seed": seeds[k], "group": group, "command": list(command)})
     runs: list[Run] = []
     try:
+        for k, folder in enumerate(folders):
+            group = {"index": k, "folders": [f.path.name for f in folders]} if together else None
+            folder.write_config({**first.config, "seed": seeds[k], "group": group, "command": list(command)})
         for group in groups:
             mine = [seeds[k] for k in group]
             part, program = (make_plan(mine[0]), None) if runs else (first, program)
