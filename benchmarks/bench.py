@@ -73,7 +73,7 @@ def install(peer: str) -> str | None:
     for command in commands:
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
-            return last_line(done.stderr) or "pip failed"
+            return last_line(done.stderr)[:200] or "pip failed"
     stamp.write_text(wanted, encoding="utf-8")
     return None
 
@@ -120,7 +120,7 @@ def say(text: str) -> None:
 def last_line(text: str) -> str:
     """The last line that says something."""
     lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
-    return lines[-1][:200] if lines else ""
+    return lines[-1] if lines else ""
 
 
 def once(contender: Contender) -> Result:
@@ -135,7 +135,7 @@ def once(contender: Contender) -> Result:
     done = subprocess.run(contender.command(), capture_output=True, text=True, cwd=ROOT, env=environment)
     seconds = time.perf_counter() - started
     if done.returncode:
-        return {"error": last_line(done.stderr) or f"exit status {done.returncode}"}
+        return {"error": last_line(done.stderr)[:200] or f"exit status {done.returncode}"}
     line = last_line(done.stdout)
     printed = json.loads(line) if line.startswith("{") else {}
     return {**printed, "process_seconds": printed.get("process_seconds") or seconds}
@@ -259,7 +259,7 @@ def dqn(size: "Size") -> list[Row]:
 
 def zoo(size: "Size") -> list[Row]:
     """From the shell's prompt to the shell's prompt."""
-    steps = 100_000
+    steps = size.zoo
     with tempfile.TemporaryDirectory() as folder:
         cache = Path(folder) / "cache"
         number = iter(range(10**6))
@@ -330,10 +330,11 @@ def start(size: "Size") -> list[Row]:
     command = Contender(lambda: [str(Path(sys.executable).with_name("rtg")), "--help"])
     helped = measure({"help": command}, 2 * size.repeats + 1)["help"]
     limits = {"ppo": 6, "ppo, cached": 1.6, "dqn": 4, "dqn, cached": 1.1}
-    title = lambda name: (
-        f"`init` and first chunk in a fresh process, {name.replace('ppo', 'PPO').replace('dqn', 'DQN')}"
-    )
-    rows = [limit(title(name), found[name], "seconds", most, "s") for name, most in limits.items()]
+    title = "`init` and first chunk in a fresh process, "
+    rows = [
+        limit(title + name.replace("ppo", "PPO").replace("dqn", "DQN"), found[name], "seconds", most, "s")
+        for name, most in limits.items()
+    ]
     return [*rows, limit("`rtg --help`", helped, "process_seconds", 0.5, "s")]
 
 
@@ -359,10 +360,11 @@ class Size:
     laps: int = 7
     ppo: int = 204_800
     dqn: int = 30_000
+    zoo: int = 100_000
     memory: int = 40_000
 
 
-QUICK = Size(repeats=1, laps=3, ppo=10_240, dqn=2_000, memory=8_000)
+QUICK = Size(repeats=1, laps=3, ppo=10_240, dqn=2_000, zoo=4_096, memory=8_000)
 
 
 # --- the table ---------------------------------------------------------------------------------------------------------------------

@@ -155,7 +155,7 @@ def memory(given: argparse.Namespace) -> dict[str, Any]:
     """Peak memory of a run with a replay of a million transitions, and how much of it is arrays."""
     state, _ = rtg.run(algorithm("dqn", capacity=1_000_000), jax.random.key(given.seed), given.steps // 4)
     arrays = sum(
-        (jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x).nbytes
+        (jax.random.key_data(x) if jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key) else x).nbytes
         for x in jax.tree.leaves(state)
     )
     # Linux counts in kilobytes, macOS in bytes.

@@ -27,8 +27,8 @@ def jit(function: Callable, **options: Any) -> Any:
 
 
 def small_env() -> Environment:
-    """CartPole cut after 12 steps: random episodes end both ways."""
-    return TimeLimit(CartPole(), 12)
+    """CartPole cut after 16 steps: random episodes end both ways."""
+    return TimeLimit(CartPole(), 16)
 
 
 def on_policy(learner: Any, **options: Any) -> Algorithm:

@@ -1,5 +1,7 @@
 """Memories: what is replayed is what was acted, exactly, through both ways an episode ends. A learning curve does not show this."""
 
+import functools
+import importlib
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +15,6 @@ from algorithms_under_test import jit
 from rewardtogo.core import Rollout, env_spec
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.time_limit import TimeLimit
-from rewardtogo.loops import collect as collect_module
 from rewardtogo.loops.collect import begin, collect
 from rewardtogo.nn import ActorCritic, ActorCriticPolicy
 from rewardtogo.value.dqn import QNetwork
@@ -32,6 +33,7 @@ def loud(network: ActorCritic) -> ActorCritic:
     return eqx.tree_at(lambda n: n.head.linear.weight, network, weight)
 
 
+@functools.cache
 def act(memory: str) -> tuple[ActorCritic, Rollout]:
     """A rollout that begins in the middle of episodes, with the memory before every step."""
 
@@ -53,7 +55,7 @@ def replayed(network: ActorCritic, rollout: Rollout, done: jax.Array) -> jax.Arr
     """Log-probabilities as a learner computes them, `[T, B]`."""
     t = rollout.transitions
     evaluate = jax.vmap(network.evaluate, in_axes=(0, 1, 1, 1), out_axes=1)
-    return evaluate(rollout.carry, t.observation, t.action, done)[0]
+    return jit(evaluate)(rollout.carry, t.observation, t.action, done)[0]
 
 
 def gap(a: jax.Array, b: jax.Array) -> float:
@@ -87,8 +89,9 @@ def test_a_carry_that_is_forgotten_shows():
 
 
 def test_a_reset_that_acting_forgets_shows(monkeypatch):
-    monkeypatch.setattr(collect_module, "reset_where", lambda done, fresh, old: old)
-    network, rollout = act("gru")
+    module = importlib.import_module("rewardtogo.loops.collect")
+    monkeypatch.setattr(module, "reset_where", lambda done, fresh, old: old)
+    network, rollout = act.__wrapped__("gru")
     t = rollout.transitions
     assert gap(replayed(network, rollout, t.done), t.extras["log_prob"]) > LOST
 
@@ -102,7 +105,7 @@ def value_after(network: ActorCritic, rollout: Rollout, reset: bool) -> tuple[ja
         lost = jax.tree.map(lambda fresh, old: jnp.where(done, fresh, old), network.critic.init(), after)
         return value, network.value(lost if reset else after, following)[1]
 
-    return jax.vmap(jax.vmap(one))(t.extras["carry"], t.observation, t.next_observation, t.done)
+    return jit(jax.vmap(jax.vmap(one)))(t.extras["carry"], t.observation, t.next_observation, t.done)
 
 
 @memories
@@ -153,7 +156,7 @@ def test_q_values_of_sequences_are_those_of_acting(memory):
         carry, q = network(carry, observation)
         return q, network(carry, after)[1]
 
-    expected, expected_following = jax.vmap(jax.vmap(one))(t.extras["carry"], t.observation, t.next_observation)
+    expected, expected_following = jit(jax.vmap(jax.vmap(one)))(t.extras["carry"], t.observation, t.next_observation)
     assert int(t.terminated[:-1].sum()) >= 1
     assert int(t.truncated[:-1].sum()) >= 1
     assert gap(q, expected) <= TOLERANCE

@@ -60,7 +60,7 @@ def test_places_that_do_not_divide_the_episodes(trained):
     env = gymnasium.make_vec(
         "CartPole-v1", num_envs=3, vectorization_mode="sync", vector_kwargs={"autoreset_mode": "SameStep"}
     )
-    assert evaluate_run(trained / "ppo", episodes=4, env=make(env))["episodes"] == 4
+    assert evaluate_run(trained / "ppo", episodes=4, env=env)["episodes"] == 4
 
 
 def test_a_run_made_with_an_object_needs_one(untrained):

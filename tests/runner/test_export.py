@@ -77,9 +77,9 @@ def lively(run, scale=30.0):
     path = run / "policy.safetensors"
     with safe_open(path, framework="numpy") as file:
         metadata = file.metadata()
-    arrays = {
-        k: np.ascontiguousarray(scale * v if "head" in k and "weight" in k else v) for k, v in load_file(path).items()
-    }
+    arrays = load_file(path)
+    heads = {k: scale * v for k, v in arrays.items() if "head" in k and "weight" in k}
+    arrays |= heads
     save_file(arrays, path, metadata)
     return run
 

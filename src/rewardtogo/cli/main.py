@@ -222,6 +222,8 @@ def _nested(pairs: Sequence[str], groups: tuple[str, ...]) -> dict[str, dict[str
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # module:Class is looked for where the user stands, too; last, so that no file there hides a library's.
+    sys.path.append(os.getcwd())
     parser, table = _parsers()
     try:
         return _dispatch(parser, table, arguments)
@@ -259,7 +261,10 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
             if names and (names[0] in ALGORITHMS or ":" in names[0]):
                 from .commands import show_options
 
-                show_options(names[0])
+                try:
+                    show_options(names[0])
+                except ValueError as error:
+                    raise RequestError(str(error)) from error
             return 0
         options, rest = table["train"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("learner", "loop", "env"))

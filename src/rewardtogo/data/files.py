@@ -108,6 +108,11 @@ def load_tree(path: Path, like: PyTree) -> PyTree:
             f"{path} has format {metadata['format']}, which is newer than this library's {FORMAT}: "
             "install a newer rewardtogo"
         )
+    extra = sorted(set(arrays) - {metadata.get(f"same:{name}", name) for name in named_leaves(like)})
+    if extra:
+        raise Damaged(
+            f"{path} has {extra[0]}, which was not expected: it belongs to another algorithm, network or environment"
+        )
     leaves = [_restore(path, name, leaf, arrays, metadata) for name, leaf in named_leaves(like).items()]
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 

@@ -88,7 +88,7 @@ def collect(
     ) -> tuple[tuple[Actor, Episodes], Transition]:
         actor, episodes = loop
         carry, action, extras = jax.vmap(lambda c, o, k: policy(c, o, k))(actor.carry, actor.observation, keys[0])
-        env_state, timestep = env.step(actor.env_state, action_spec.clip(action), keys[1])
+        env_state, timestep = env.step(actor.env_state, jax.vmap(action_spec.clip)(action), keys[1])
         done = timestep.done
         total = actor.stats.return_so_far + timestep.score
         steps = actor.stats.length_so_far + 1.0

@@ -55,6 +55,8 @@ class OffPolicy(Algorithm, Configured):
             raise ValueError(
                 f"{type(self.learner).__name__} needs fresh rollouts of its own policy, which a replay cannot give: use OnPolicy"
             )
+        if self._block < 1:
+            return  # what is wrong with `unroll` is said by its own range
         if self.replay.capacity < self._block:
             raise ValueError(
                 f"a replay of {self.replay.capacity} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "

@@ -10,7 +10,7 @@ import inspect
 import math
 import types
 import typing
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from ..core import Schedule
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+
+Module = TypeVar("Module")
 
 PARTS: dict[str, type] = {c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay)}
 
@@ -80,15 +82,7 @@ def build(cls: type, data: dict[str, Any], **fixed: Any) -> Any:
 
     Raises `ValueError`, naming the nearest option, for one that the class does not have or a value that it cannot take.
     """
-    known = options(cls)
-    values: dict[str, Any] = {}
-    for name, value in data.items():
-        if name == "class":
-            continue
-        if name not in known:
-            raise ValueError(f"{cls.__name__} has no option {name!r}: {nearest(name, known)}")
-        values[name] = _value(cls, known[name], value)
-    values |= fixed
+    values = _values(cls, data) | fixed
     splat = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.VAR_POSITIONAL]
     several = values.pop(splat[0], ()) if splat else ()
     if not isinstance(several, tuple):
@@ -99,6 +93,19 @@ def build(cls: type, data: dict[str, Any], **fixed: Any) -> Any:
         raise ValueError(
             f"{cls.__name__} cannot be made from the options {', '.join(values) or '(none)'}: {error}"
         ) from error
+
+
+def override(module: Module, data: dict[str, Any]) -> Module:
+    """The same module with some hyperparameters replaced; raises as `build` does."""
+    return dataclasses.replace(module, **_values(type(module), data)) if data else module  # type: ignore[type-var]
+
+
+def _values(cls: type, data: dict[str, Any]) -> dict[str, Any]:
+    known = options(cls)
+    unknown = [name for name in data if name != "class" and name not in known]
+    if unknown:
+        raise ValueError(f"{cls.__name__} has no option {unknown[0]!r}: {nearest(unknown[0], known)}")
+    return {name: _value(cls, known[name], value) for name, value in data.items() if name != "class"}
 
 
 def _value(cls: type, field: dataclasses.Field, value: Any) -> Any:

@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 
 from ..core import EnvSpec, Learner, Policy, Spec, VectorEnv, env_spec
 from ..data.files import Damaged
-from ..envs.gymnasium import hosted
-from ..envs.registry import COMPILED, make
+from ..envs.gymnasium import GymnasiumEnv, hosted
+from ..envs.registry import BACKENDS, COMPILED, make
 from ..envs.vectorize import Vectorized, vectorize
 from .engine import Program
 from .evaluate import Evaluator, lanes_for, summary
@@ -100,10 +101,14 @@ def environment_of(folder: RunFolder, env: Any, backend: str | None, episodes: i
         raise ValueError("the run learnt from a dataset without an environment: name one with --env")
     if backend is None:
         backend = described["backend"] if name == described["id"] else "auto"
+    if backend not in BACKENDS:
+        raise ValueError(f"there is no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if isinstance(name, Vectorized):
         return vectorize(name.env, lanes_for(episodes, compiled=True))
     if isinstance(name, VectorEnv):
         return name
+    if isinstance(name, (gymnasium.Env, gymnasium.vector.VectorEnv)):
+        return GymnasiumEnv(name)
     compiled = name in COMPILED and backend != "gymnasium" and not kwargs if isinstance(name, str) else True
     lanes = lanes_for(episodes, compiled)
     return make(name, lanes, backend=backend, **kwargs)  # type: ignore[arg-type]

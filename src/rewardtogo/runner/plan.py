@@ -17,7 +17,7 @@ from ..data.episodes import load_dataset
 from ..envs.gymnasium import hosted
 from ..envs.registry import COMPILED, make
 from ..envs.vectorize import Vectorized, vectorize
-from .config import build, describe, merge, resolve
+from .config import build, describe, merge, override, resolve
 from .engine import iterations_for, steps_after
 from .evaluate import lanes_for
 from .policy import restore_learner
@@ -79,7 +79,9 @@ def plan(
         whole, inner = algorithm, _learner_of(algorithm)
         vector_env: VectorEnv | None = _env_of(algorithm)
     else:
-        inner = _learner(algorithm, merge(ready.get("learner", {}), learner or {}))
+        # A learner object says what it wants: a preset's values are for names.
+        known = {} if isinstance(algorithm, Learner) else ready.get("learner", {})
+        inner = _learner(algorithm, merge(known, learner or {}))
         options = merge(ready.get("loop", {}), loop or {})
         kind = (
             algorithm_row(name).loop
@@ -255,9 +257,7 @@ def _name_of(algorithm: Learner | Algorithm) -> str:
 
 def _learner(algorithm: str | Learner, data: dict[str, Any]) -> Learner:
     if isinstance(algorithm, Learner):
-        if data:
-            return build(type(algorithm), {**describe(algorithm), **data})
-        return algorithm
+        return override(algorithm, data)
     cls = resolve(algorithm if ":" in algorithm else algorithm_row(algorithm).path)
     if not (isinstance(cls, type) and issubclass(cls, Learner)):
         raise ValueError(f"{algorithm} is no learner: name a class that derives from rewardtogo.Learner")

@@ -84,11 +84,7 @@ class LoadedPolicy:
         self._key = jax.random.key(0)
         self._carry: Any = None
         self._batch: int | None = None
-        self._act = jax.jit(
-            lambda policy, carry, observation, keys: jax.vmap(lambda c, o, k: policy(c, o, k)[:2])(
-                carry, observation, keys
-            )
-        )
+        self._act = jax.jit(jax.vmap(self._choose, in_axes=(None, 0, 0, 0)))
         self._inspect = jax.jit(
             lambda policy, carry, observation: jax.vmap(lambda c, o: policy.inspect(c, o))(carry, observation)
         )
@@ -106,8 +102,12 @@ class LoadedPolicy:
         size = len(jax.tree.leaves(observation)[0])
         self._key, key = jax.random.split(self._key)
         self._carry, action = self._act(policy, self._memory(policy, size), observation, jax.random.split(key, size))
-        action = jax.device_get(jax.vmap(self.spec.action.clip)(action))
+        action = jax.device_get(action)
         return self._outward(action if batched else jax.tree.map(lambda x: x[0], action), batched)
+
+    def _choose(self, policy: Policy, carry: Any, observation: Any, key: jax.Array) -> tuple[Any, Any]:
+        carry, action, _ = policy(carry, observation, key)
+        return carry, self.spec.action.clip(action)
 
     def policy(self, explore: bool = False) -> Policy:
         """The policy as loops and evaluations take it: one observation in the library's own form, without clipping."""
@@ -119,7 +119,7 @@ class LoadedPolicy:
         policy = self._policies["greedy"]
         size = len(jax.tree.leaves(observation)[0])
         thoughts = jax.device_get(self._inspect(policy, self._memory(policy, size), observation))
-        return {name: value if batched else value[0] for name, value in thoughts.items()}
+        return {name: value if batched else np.asarray(value[0]) for name, value in thoughts.items()}
 
     def _memory(self, policy: Policy, size: int) -> Any:
         if self._carry is None or self._batch != size:
@@ -132,8 +132,6 @@ class LoadedPolicy:
         if spec.kind != "dict":
             value, batched = _element(spec, observation, "")
             return value if batched else value[None], batched
-        if isinstance(observation, (tuple, list)):
-            observation = {str(i): part for i, part in enumerate(observation)}
         flat = _flatten(observation)
         missing = [name for name, _ in spec.parts if name not in flat]
         if missing:
@@ -156,7 +154,7 @@ class LoadedPolicy:
 
 
 def _flatten(tree: Any, name: str = "") -> dict[str, Any]:
-    if isinstance(tree, (tuple, list)):
+    if isinstance(tree, tuple):
         tree = {str(i): part for i, part in enumerate(tree)}
     if not isinstance(tree, dict):
         return {name: tree}

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
 from ..core import Algorithm, Learner, PRNGKey, Rollout, State
 from ..envs.gymnasium import GymnasiumEnv, hosted
@@ -214,7 +215,9 @@ class _Parts:
 
 
 def _many(part: Callable) -> Callable:
-    def many(algorithm: Algorithm, state: State, result: Any, rollout: Any, key: PRNGKey, count: int) -> Any:
+    def many(
+        algorithm: Algorithm, state: State, result: Any, rollout: Any, key: PRNGKey, count: Int[Array, ""] | int
+    ) -> Any:
         def once(i: jax.Array, loop: tuple[State, Any]) -> tuple[State, Any]:
             # What a part gives is carried along, so that the compiler leaves none of it out; and parameters and data look
             # new in each iteration, as they are in training, so that it does not prepare them once for all.
