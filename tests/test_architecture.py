@@ -276,28 +276,41 @@ def fields_of(cls: Name) -> list[str]:
 MODULES = [cls for cls in CLASSES if is_module(cls)]
 
 
-def test_modules_are_abstract_or_final():
-    assert len(MODULES) > 40
+def inheritance_faults(classes: list[Name]) -> list[str]:
     found = []
-    for cls in MODULES:
+    for cls in classes:
         for base in bases(cls):
             if not isinstance(base, str) and base[1] not in PROTOCOL_BASES and not abstract_methods(base):
                 found.append(f"{'.'.join(cls[0])}.{cls[1]} inherits {base[1]}, which is final")
         if (abstract_methods(cls) or cls[1] in PROTOCOL_BASES) and fields_of(cls):
             found.append(f"{'.'.join(cls[0])}.{cls[1]} is abstract and has fields {fields_of(cls)}")
-    fail(found)
+    return found
 
 
-def test_the_rule_finds_what_it_forbids():
-    """The rule above, on classes made to break it."""
-    text = "class A(eqx.Module):\n    x: int\nclass B(A):\n    y: int\n"
-    for node in ast.parse(text).body:
-        CLASSES[("core", "made_up"), node.name] = node  # type: ignore[attr-defined, index]
-    try:
-        assert abstract_methods((("core", "made_up"), "A")) == set()
-        assert is_module((("core", "made_up"), "A"))
-    finally:
-        del CLASSES[("core", "made_up"), "A"], CLASSES[("core", "made_up"), "B"]
+def test_modules_are_abstract_or_final():
+    assert len(MODULES) > 40
+    fail(inheritance_faults(MODULES))
+
+
+def test_the_rule_finds_what_it_forbids(monkeypatch):
+    """The rule above, on classes made to break it: one that inherits a final one, and an abstract one with a field."""
+    text = """
+class Final(eqx.Module):
+    x: int
+class Child(Final):
+    y: int
+class Abstract(eqx.Module):
+    z: int
+    @abstractmethod
+    def method(self): ...
+"""
+    path = SOURCE / "core" / "made_up.py"
+    monkeypatch.setitem(TREES, path, ast.parse(text))
+    made = [(("core", "made_up"), node.name) for node in TREES[path].body if isinstance(node, ast.ClassDef)]
+    for cls, node in zip(made, TREES[path].body, strict=True):
+        monkeypatch.setitem(CLASSES, cls, node)
+    assert all(is_module(cls) for cls in made)
+    assert len(inheritance_faults(made)) == 2
 
 
 # --- what is public --------------------------------------------------------------------------------------------------

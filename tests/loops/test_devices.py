@@ -29,7 +29,7 @@ def test_an_explicit_mesh_is_refused():
         shard(jnp.ones(4))
 
 
-@pytest.mark.parametrize("name", ["ppo", "dqn"])
+@pytest.mark.parametrize("name", ["ppo", pytest.param("dqn", marks=pytest.mark.slow)])
 def test_a_run_on_two_devices_is_the_run_on_one(name):
     """Through the engine, in several chunks: what a chunk gives back lies where the next one takes it."""
     train = lambda: rtg.run(ALGORITHMS_UNDER_TEST[name](), jax.random.key(0), 3, row_every=1, chunk_seconds=1e-6)  # noqa: E731

@@ -136,7 +136,7 @@ def test_the_memory_is_fresh_after_each_end(memory):
         np.testing.assert_array_equal(first, stored[0])
 
 
-@memories
+@pytest.mark.parametrize("memory", ["lstm", pytest.param("gru", marks=pytest.mark.slow)])
 def test_q_values_of_sequences_are_those_of_acting(memory):
     learner = rtg.DQN(network=MEMORIES[memory], epsilon=0.5)
     loop = rtg.OffPolicy(ENV, learner, rtg.UniformReplay(512), unroll=5, warm_up=200, batch_size=16, length=20)

@@ -93,7 +93,7 @@ def test_warnings(make_run):
 
 
 def test_trained_runs(trained):
-    found = compare([trained / "seeds", trained / "ppo", trained / "dqn"])
+    found = compare([trained / "seeds", trained / "ppo", trained / "other"])
     counts = {g["algorithm"]: g["seeds"] for g in found["groups"]}
     assert counts == {"ppo": 4, "dqn": 1} and "seed 0" in found["warning"]
 

@@ -19,18 +19,18 @@ READER = """
 import json, sys
 import numpy as np
 import jax.export
-path, given, out = sys.argv[1:]
-about = json.load(open(path + ".json"))
-data = dict(np.load(given))
-size = len(next(iter(data.values())))
-observation = data["observation"] if list(data) == ["observation"] else data
-call = jax.export.deserialize(open(path, "rb").read()).call
-memory = [np.full([size, *m["shape"][1:]], m["initial"], m["dtype"]) for m in about["memory"]]
-actions = []
-for _ in range(3):
-    action, memory = call(observation, memory) if memory else (call(observation), memory)
-    actions.append(np.asarray(action))
-np.save(out, np.stack(actions))
+for path in sys.argv[1:]:
+    about = json.load(open(path + ".json"))
+    data = dict(np.load(path + ".npz"))
+    size = len(next(iter(data.values())))
+    observation = data["observation"] if list(data) == ["observation"] else data
+    call = jax.export.deserialize(open(path, "rb").read()).call
+    memory = [np.full([size, *m["shape"][1:]], m["initial"], m["dtype"]) for m in about["memory"]]
+    actions = []
+    for _ in range(3):
+        action, memory = call(observation, memory) if memory else (call(observation), memory)
+        actions.append(np.asarray(action))
+    np.save(path + ".npy", np.stack(actions))
 assert "rewardtogo" not in sys.modules and "equinox" not in sys.modules
 """
 
@@ -93,23 +93,22 @@ def test_stablehlo_without_this_library(untrained, tmp_path):
         "memory": untrained("ppo", "CartPole-v1", network=GRU(8, MLP(8))),
         "parts": untrained("ppo", lambda: Strange("discrete")),
     }
+    batches, paths = {}, {}
     for name, run in runs.items():
-        policy = load(lively(run))
-        space = policy.observation_space
-        batch = observations(space if name == "parts" else spaces.Box(-3, 3, space.shape, np.float32))
-        path = export(run)
-        assert path == run / "policy.stablehlo"
+        space = load(lively(run)).observation_space
+        batches[name] = observations(space if name == "parts" else spaces.Box(-3, 3, space.shape, np.float32))
+        paths[name] = export(run)
+        assert paths[name] == run / "policy.stablehlo"
         about = json.loads((run / "policy.stablehlo.json").read_text())
         assert about["platforms"] == ["cpu", "cuda", "tpu"] and bool(about["memory"]) == (name == "memory")
-        batched = about["observation"]["choice"] if name == "parts" else about["observation"]
-        assert batched["shape"][0] == "N"
-        np.savez(tmp_path / "given.npz", **batch)
-        command = [sys.executable, "-c", READER, str(path), str(tmp_path / "given.npz"), str(tmp_path / "out.npy")]
-        subprocess.run(command, check=True, cwd=tmp_path)
+        assert (about["observation"]["choice"] if name == "parts" else about["observation"])["shape"][0] == "N"
+        np.savez(f"{paths[name]}.npz", **batches[name])
+    subprocess.run([sys.executable, "-c", READER, *map(str, paths.values())], check=True, cwd=tmp_path)
+    for name, run in runs.items():
+        policy, batch = load(run), batches[name]
         seen = batch["observation"] if list(batch) == ["observation"] else batch
-        found = np.load(tmp_path / "out.npy")
         wanted = np.stack([policy(seen) for _ in range(3)])
-        np.testing.assert_allclose(found, wanted, atol=1e-6, err_msg=name)
+        np.testing.assert_allclose(np.load(f"{paths[name]}.npy"), wanted, atol=1e-6, err_msg=name)
         assert len(np.unique(wanted)) > 1 and (name != "parts" or wanted.min() < 0)
 
 

@@ -36,6 +36,7 @@ from ..core import (
 from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Adam, Network, RunningNorm, as_network, global_norm
 from ..ops.advantages import gae, normalise
 from ..ops.metrics import explained_variance
+from ..ops.shuffle import permutations
 
 
 class PPOState(eqx.Module):
@@ -109,7 +110,7 @@ class PPO(Learner):
             return now._optimiser().step(network, gradient, optimiser), metrics | {"grad_norm": global_norm(gradient)}
 
         used = self.minibatches * per_minibatch
-        shuffled = jax.vmap(lambda k: jax.random.permutation(k, size)[:used])(jax.random.split(key, self.epochs))
+        shuffled = permutations(key, self.epochs, size)[:, :used]
         loop = (state.network, state.optimiser)
         (network, optimiser), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
         # Statistics change after the update, so that the ratio starts at exactly 1.

@@ -30,6 +30,8 @@ from .plan import Plan
 
 STRETCH = 0.1
 """Seconds that a part is run for before the clock is read, about."""
+MOST = 2**20
+"""Iterations beyond which no part is run, however fast."""
 PATIENCE = 60.0
 """Seconds after which no further round begins."""
 
@@ -147,12 +149,16 @@ def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
     evaluate()
     for part in parts.names:
         parts.advance(part, 1)
-    count = _stretch(lambda count: clock.lap(lambda: parts.advance("whole", count))[0], plan.config["iterations"])
+    count = _stretch(lambda count: clock.lap(lambda: parts.advance("whole", count))[0])
     rows, began = [], time.monotonic()
     while len(rows) < rounds and (not rows or time.monotonic() - began < PATIENCE):
         collection, foreign, _ = clock.lap(lambda: parts.advance("collection", count))
-        learning, whole = (clock.lap(lambda p=p: parts.advance(p, count))[0] for p in ("learning", "whole"))
-        evaluation, again = clock.lap(evaluate)[0], clock.lap(evaluate)[0]
+        learning, _, _ = clock.lap(lambda: parts.advance("learning", count))
+        evaluation, _, _ = clock.lap(evaluate)
+        whole, _, _ = clock.lap(lambda: parts.advance("whole", count))
+        again, _, _ = clock.lap(
+            evaluate
+        )  # after a program of iterations like the first time, with caches in the same state
         every = plan.config["eval_every"]
         rows.append(
             (collection / count, learning / count, evaluation / every, whole / count + again / every, foreign / count)
@@ -161,11 +167,11 @@ def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
     return Anatomy(collection, learning, evaluation, whole, foreign if hosted(plan.env) else None)
 
 
-def _stretch(seconds: Callable[[int], float], most: int) -> int:
+def _stretch(seconds: Callable[[int], float]) -> int:
     """Iterations that take about `STRETCH`, found by doubling, since a call by itself costs as much as many iterations."""
     count = 1
-    while count < most and seconds(count) < STRETCH / 2:
-        count = min(2 * count, most)
+    while count < MOST and seconds(count) < STRETCH / 2:
+        count = 2 * count
     return count
 
 

@@ -188,7 +188,7 @@ class Session:
         began = time.monotonic()
         states = RunState(
             moment.state,
-            jnp.moveaxis(moment.sums, -1, 0) if self.batched else moment.sums,
+            moment.sums,
             jnp.asarray(self.best if self.batched else self.best[0], jnp.float32),
         )
         about = {"env_steps": moment.env_steps, "seconds": self.seconds_before + moment.seconds}
@@ -487,7 +487,7 @@ def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: 
     sums = jax.eval_shape(program.fresh_sums, shapes)
     like = RunState(shapes, sums, jax.ShapeDtypeStruct(program.key.shape, jnp.float32))
     if session.batched:
-        sums = jax.ShapeDtypeStruct(sums.shape[:-1], sums.dtype)
+        sums = jax.ShapeDtypeStruct(sums.shape[1:], sums.dtype)
         like = RunState(
             jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes),
             sums,
@@ -508,7 +508,7 @@ def _restore(session: Session, part: Plan, folders: Sequence[RunFolder], start: 
             state,
             is_leaf=lambda x: isinstance(x, Actor),
         )
-    return state, jnp.moveaxis(whole.sums, 0, -1) if session.batched else whole.sums, start
+    return state, whole.sums, start
 
 
 __all__ = ["Damaged", "Interrupted", "Run", "lanes_for", "resume", "train"]
