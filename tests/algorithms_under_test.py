@@ -8,6 +8,7 @@ import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import rewardtogo as rtg
 from rewardtogo.core import MASK, Algorithm, Environment, Timestep, Transition, env_spec
@@ -55,6 +56,14 @@ def demonstrations() -> Dataset:
 
 def offline(learner: Any, **options: Any) -> Algorithm:
     return rtg.Offline(demonstrations(), learner, **{"batch_size": 8, "updates": 2, "length": 4, **options})
+
+
+def first_gradient(optimiser: Any, parameters: Any) -> Any:
+    """The gradient that reached Adam at its first step, ten times its first moment, in the shape of the parameters."""
+    flat, unravel = ravel_pytree(parameters)
+    moment = 10.0 * ravel_pytree(optimiser[1][0].mu)[0]
+    assert moment.shape == flat.shape
+    return unravel(moment)
 
 
 small, gru, lstm = rtg.MLP(8), rtg.GRU(6, rtg.MLP(5)), rtg.LSTM(6, rtg.MLP(5))

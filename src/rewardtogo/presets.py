@@ -43,6 +43,20 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "loop": {"unroll": 128},
         "learner": {**_PPO, "normalise_observations": True},
     },
+    ("dqn", "CartPole-v1"): {
+        "steps": 100_000,
+        "num_envs": 1,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 128},
+        "learner": {
+            "learning_rate": "linear:1e-3:1e-4",
+            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
+            "epsilon": "linear:1:0.1:0.12",
+            "target_period": 400,
+            "double": True,
+            "huber": 10.0,
+            "max_grad_norm": 100.0,
+        },
+    },
     ("reinforce", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
 }
 """Keys are the algorithm's name and the environment's id."""

@@ -15,5 +15,5 @@ def permutations(key: Key[Array, ""], count: int, size: int) -> Int32[Array, "co
     bits = max(1, (size - 1).bit_length())
     random = jax.random.bits(key, (count, size), jnp.uint32)
     index = jnp.arange(size, dtype=jnp.uint32)
-    packed = jnp.sort((random >> bits << bits) | index, axis=-1)
+    packed = jnp.sort((random >> bits << bits) | index[None], axis=-1)
     return (packed & jnp.uint32((1 << bits) - 1)).astype(jnp.int32)
