@@ -85,7 +85,8 @@ def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
         from ..runner.profile import profile
 
         for run in found if isinstance(found, list) else [found]:
-            print(profile(run.path), file=sys.stderr)
+            own = given.algorithm if ":" in given.algorithm else None
+            print(profile(run.path, _learner_for(str(run.path), own)), file=sys.stderr)
 
 
 def _config_file(path: str) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
             return make(made, num_envs)
         if isinstance(made, gymnasium.Env):
             made.close()
-    return GymnasiumEnv(cast(Source, env), num_envs or 1, kwargs=kwargs)
+    return GymnasiumEnv(cast(Source, env), num_envs, kwargs=kwargs)
 
 
 def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any]) -> VectorEnv:

@@ -76,7 +76,7 @@ def collect_demonstrations(
     name, vector_env = _environment(config["env"], env, backend, episodes)
     try:
         require_spec(loaded.spec, env_spec(vector_env), "the policy")
-        inner = loaded._policies["greedy" if deterministic else "explore"]
+        inner = loaded.policy(explore=not deterministic)
         policy = Recorded(inner, loaded.spec, float(noise), not deterministic)
         dataset = play(vector_env, policy, episodes, jax.random.key(seed))
     finally:

@@ -150,7 +150,9 @@ class Program:
 
     def init(self) -> State:
         """A fresh state: one compiled program, because op by op costs seconds."""
-        program = self._compile(self._init_all, self.algorithm, self.key)
+        # It runs once, so that optimising it would cost more than it saves.
+        quickly = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
+        program = self._compile(self._init_all, self.algorithm, self.key, compiler_options=quickly)
         return self.guarded(lambda: program(self.algorithm, self.key))
 
     def fresh_sums(self, state: State) -> Array:
