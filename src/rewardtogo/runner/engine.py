@@ -366,7 +366,7 @@ def run(
         pace = spent / length if pace is None else max(spent / length, pace / 2)
         rows = program.rows(table, done, done + length)
         program.check(state, rows)
-        done, history = done + length, history + rows
+        done, history = done + length, [*history, *(dict(row) for row in rows)]
         seconds += spent
         moment = Moment(algorithm, state, sums, done, iterations, rows, seconds, program.compile_seconds)
         for callback in callbacks:
