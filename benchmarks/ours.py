@@ -37,7 +37,7 @@ def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
 
 def train(given: argparse.Namespace) -> dict[str, Any]:
     """A whole run with its folder, metrics and evaluations: steps a second as the library itself reports them."""
-    seen: list[rtg.Moment] = []
+    seen: list[tuple[int, float, float]] = []
     on_policy = given.name == "ppo"
     with tempfile.TemporaryDirectory() as folder:
         run = rtg.train(
@@ -51,15 +51,15 @@ def train(given: argparse.Namespace) -> dict[str, Any]:
             preset="none",
             learner=PPO if on_policy else DQN,
             loop={"unroll": 128} if on_policy else OFF,
-            callbacks=[lambda moment: seen.__setitem__(slice(None), [moment])],
+            callbacks=[lambda moment: seen.append((moment.env_steps, moment.seconds, moment.compile_seconds))],
             quiet=True,
         )
-    last = seen[0]
-    steps = last.env_steps - last.algorithm.initial_steps
+    # The first chunk, a single iteration, is the warm-up.
+    (first_steps, first_seconds, _), (steps, seconds, compile_seconds) = seen[0], seen[-1]
     return {
-        "rate": steps / last.seconds,
+        "rate": (steps - first_steps) / (seconds - first_seconds),
         "return": run.evaluation["return_mean"],
-        "compile_seconds": last.compile_seconds,
+        "compile_seconds": compile_seconds,
     }
 
 
