@@ -31,13 +31,13 @@ class Returns(eqx.Module):
     finished: Float[Array, "L"]
 
 
-@partial(jax.jit, static_argnames=("quota",))
-def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
-    """Play `quota` episodes in each environment."""
+@partial(jax.jit, static_argnames=("rows",))
+def _play(env: VectorEnv, policy: Policy, key: Array, quota: Array | int, rows: int) -> Returns:
+    """Play `quota` episodes in each environment, at most `rows`: one program serves every number up to it."""
     action_spec, lanes = env_spec(env).action, env.num_envs
     begin_key, carry_key, loop_key = jax.random.split(key, 3)
     fresh = fresh_carry(policy, carry_key, lanes)
-    table = jnp.zeros((quota, lanes))
+    table = jnp.zeros((rows, lanes))
 
     def going(loop: tuple) -> Array:
         _, returns, step = loop
@@ -51,7 +51,7 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
         env_state, timestep = env.step(actor.env_state, action_spec.clip(action), jax.random.split(env_key, lanes))
         done = timestep.done
         total, length = actor.stats.return_so_far + timestep.score, actor.stats.length_so_far + 1.0
-        here = (jnp.arange(quota, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
+        here = (jnp.arange(rows, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
         found = Returns(
             jnp.where(here, total[None, :], found.returns),
             jnp.where(here, length[None, :], found.lengths),
@@ -67,35 +67,40 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: int) -> Returns:
 class Evaluator:
     """Plays policies in `env`, `episodes` at a time. Policies of one kind share one compiled program.
 
+    A call may ask for another number of episodes; up to `most` the same program serves.
     With `seeds`, policies have a leading axis of seeds and so have the results.
     """
 
-    def __init__(self, env: VectorEnv, episodes: int, seeds: bool = False):
+    def __init__(self, env: VectorEnv, episodes: int, seeds: bool = False, most: int = 0):
         if episodes < 1:
             raise ValueError(f"an evaluation needs at least one episode, not {episodes}")
-        self.env, self.seeds = env, seeds
-        self.quota = -(-episodes // env.num_envs)
+        self.env, self.seeds, self.episodes = env, seeds, episodes
+        self._rows = self._quota(max(episodes, most))
 
-    def __call__(self, policy: Policy, key: Array) -> tuple[np.ndarray, np.ndarray]:
+    def _quota(self, episodes: int) -> int:
+        return -(-episodes // self.env.num_envs)
+
+    def __call__(self, policy: Policy, key: Array, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns and lengths `[N]` (`[K, N]` with seeds), N the episodes asked for, rounded up to whole rounds.
 
         Raises `ValueError` where an episode does not end, `EnvironmentFailure` where a foreign environment fails.
         """
-        play: Callable[..., Any] = partial(_play, quota=self.quota)
+        quota = self._quota(self.episodes if episodes is None else episodes)
+        play: Callable[..., Any] = partial(_play, rows=max(self._rows, quota))
         if self.seeds:
-            play = jax.vmap(play, in_axes=(None, 0, None))
+            play = jax.vmap(play, in_axes=(None, 0, None, None))
         try:
-            found = jax.device_get(play(self.env, policy, key))
+            found = jax.device_get(play(self.env, policy, key, quota))
         except Exception as error:
             failure = failure_of(self.env)
             raise (failure or error) from (error if failure else None)
-        if np.any(found.finished < self.quota):
+        if np.any(found.finished < quota):
             raise ValueError(
-                f"an episode of this environment did not end within {MAX_STEPS * self.quota} steps, so it has no return: "
+                f"an episode of this environment did not end within {MAX_STEPS * quota} steps, so it has no return: "
                 "give the environment a time limit (gymnasium.make(..., max_episode_steps=N), or rtg.envs.TimeLimit)"
             )
         flat = (*found.returns.shape[:-2], -1)
-        return found.returns.reshape(flat), found.lengths.reshape(flat)
+        return found.returns[..., :quota, :].reshape(flat), found.lengths[..., :quota, :].reshape(flat)
 
 
 def lanes_for(episodes: int, compiled: bool) -> int:

@@ -133,7 +133,9 @@ class Session:
         self.program = program or program_of(plan, seeds)
         self.key = self.program.key
         episodes = plan.config["eval_episodes"]
-        self.evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, episodes, self.batched)
+        self.evaluator = (
+            None if plan.eval_env is None else Evaluator(plan.eval_env, episodes, self.batched, FINAL_EPISODES)
+        )
         self.sinks: list[list[Sink]] = [
             [CSV(f), *(SINKS[name](f, plan.config) for name in sinks)] for f in self.folders
         ]
@@ -288,9 +290,8 @@ class Session:
         results: list[dict[str, Any] | None] = [None] * len(self.seeds)
         if self.evaluator is not None:
             key = jax.random.fold_in(jax.random.key(self.seeds[0] ^ 0x5EED), 2**31 - 1)
-            self.evaluator.quota = -(-FINAL_EPISODES // self.evaluator.env.num_envs)
-            greedy = self.evaluator(self._policy(moment.state, False), key)
-            explore = self.evaluator(self._policy(moment.state, True), key)
+            greedy = self.evaluator(self._policy(moment.state, False), key, FINAL_EPISODES)
+            explore = self.evaluator(self._policy(moment.state, True), key, FINAL_EPISODES)
             for k in range(len(self.seeds)):
                 pick = lambda found, k=k: [x[k] if self.batched else x for x in found]  # noqa: E731
                 results[k] = {
