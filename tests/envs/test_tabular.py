@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from rewardtogo.core import env_spec
+from rewardtogo.envs.reward_wrappers import RewardFunction
 from rewardtogo.envs.tabular import MDP, POMDP, TabularEnv, TabularModel
 from rewardtogo.envs.tabular_problems import MOVES, PACMAN_BOARD, aliased_corridor, pacman, random_mdp, random_policy
-from rewardtogo.envs.tabular_rewards import TableReward, WithReward
+from rewardtogo.envs.tabular_rewards import TableReward
 from rewardtogo.exact import (
     TablePolicy,
     best_deterministic_policy,
@@ -223,8 +224,8 @@ def test_swapping_in_the_true_reward_changes_nothing(item, key):
     mdp = random_mdp(9, 4, 3, num_terminal=1)
     env, policy = TabularEnv(mdp), TablePolicy(jnp.asarray(random_policy(10, 4, 3), jnp.float32))
     plain = simulate(env, policy, key, 100, 20)
-    swapped = simulate(WithReward(env, TableReward(jnp.asarray(mdp.rewards, jnp.float32))), policy, key, 100, 20)
-    other = simulate(WithReward(env, TableReward(jnp.ones((4, 3)))), policy, key, 100, 20)
+    swapped = simulate(RewardFunction(env, TableReward(jnp.asarray(mdp.rewards, jnp.float32))), policy, key, 100, 20)
+    other = simulate(RewardFunction(env, TableReward(jnp.ones((4, 3)))), policy, key, 100, 20)
     with item("1.10") as check:
         check(np.abs(plain.returns(0.9) - swapped.returns(0.9)).max(), "==", 0, "returns under the true reward")
         check(np.abs(other.rewards.sum(1) - other.lengths).max(), "==", 0, "a reward of 1 counts the steps")

@@ -153,7 +153,7 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
     source = described["id"] if env is None else env
     inner = restore_learner({"algorithm": config["algorithm"], "learner": config["learner"]}, learner)
     kind = config["loop"]["class"]
-    if kind not in LOOPS.values() and kind not in {path.replace(":", ":") for path in LOOPS.values()}:
+    if kind not in LOOPS.values():
         raise ValueError(
             f"the run was made with {kind}, which is not one of the library's loops: resume it from Python with rtg.run"
         )
