@@ -35,7 +35,7 @@ def ppo(env: Probe) -> Algorithm:
 
 
 def reinforce(env: Probe) -> Algorithm:
-    learner = rtg.REINFORCE(
+    learner = rtg.PolicyGradient(
         network=NETWORK,
         learning_rate=Linear(3e-2, 0.0),
         value_learning_rate=Linear(3e-2, 0.0),

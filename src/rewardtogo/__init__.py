@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from .nn.recurrent import GRU as GRU
     from .nn.recurrent import LSTM as LSTM
     from .policy_gradient.ppo import PPO as PPO
-    from .policy_gradient.reinforce import REINFORCE as REINFORCE
+    from .policy_gradient.vanilla import PolicyGradient as PolicyGradient
     from .runner.engine import Every as Every
     from .runner.engine import Moment as Moment
     from .runner.engine import NonFinite as NonFinite
@@ -71,7 +71,7 @@ _HOMES = {
     "nn.network": "CNN MLP",
     "nn.recurrent": "GRU LSTM",
     "policy_gradient.ppo": "PPO",
-    "policy_gradient.reinforce": "REINFORCE",
+    "policy_gradient.vanilla": "PolicyGradient",
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
     "runner.train": "Run resume train",

@@ -3,11 +3,15 @@
 import dataclasses
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One algorithm: where its learner lives, which loop runs it, where the notes have it, and what it can act in."""
+    """One algorithm: where its learner lives, which loop runs it, where the notes have it, and what it can act in.
+
+    Several algorithms may be settings of one learner: `learner`, `loop_options` and `num_envs` are what a row sets, unless the user does.
+    """
 
     name: str
     path: str
@@ -16,9 +20,14 @@ class Row:
     number: str
     actions: tuple[str, ...]
     summary: str
+    learner: dict[str, Any] = dataclasses.field(default_factory=dict)
+    loop_options: dict[str, Any] = dataclasses.field(default_factory=dict)
+    num_envs: int | None = None
 
 
 ANY = ("discrete", "multi_discrete", "multi_binary", "box")
+_VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
+_ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
 
 ALGORITHMS: dict[str, Row] = {
     row.name: row
@@ -34,12 +43,88 @@ ALGORITHMS: dict[str, Row] = {
         ),
         Row(
             "reinforce",
-            "rewardtogo.policy_gradient.reinforce:REINFORCE",
+            _VANILLA,
             "on_policy",
             "3",
             "Alg 2",
             ANY,
             "Monte-Carlo policy gradient with reward-to-go and a learned baseline",
+        ),
+        Row(
+            "vpg",
+            _VANILLA,
+            "on_policy",
+            "3",
+            "3.7",
+            ANY,
+            "policy gradient with any returns, baseline and discounting; GAE unless told otherwise",
+            {"returns": "gae"},
+        ),
+        Row(
+            "batch_ac",
+            _VANILLA,
+            "on_policy",
+            "4",
+            "Alg 3, 4",
+            ANY,
+            "batch actor-critic: fit V, then one step on r + gamma V(s') - V(s)",
+            _ONE_STEP,
+        ),
+        Row(
+            "online_ac",
+            _VANILLA,
+            "on_policy",
+            "4",
+            "Alg 5",
+            ANY,
+            "online actor-critic: an update for every step, of one environment or of several side by side",
+            _ONE_STEP
+            | {
+                "value_target": "td",
+                "value_updates": 1,
+                "learning_rate": 3e-4,
+                "value_learning_rate": 1e-3,
+                "normalise_advantages": False,
+            },
+            {"unroll": 1},
+            8,
+        ),
+        Row(
+            "a2c",
+            _VANILLA,
+            "on_policy",
+            "4",
+            "4.7",
+            ANY,
+            "synchronous advantage actor-critic: short rollouts of several environments",
+            {
+                "optimiser": "rmsprop",
+                "learning_rate": 7e-4,
+                "value_learning_rate": 7e-4,
+                "value_updates": 1,
+                "max_grad_norm": 0.5,
+                "normalise_advantages": False,
+            },
+            {"unroll": 5},
+            8,
+        ),
+        Row(
+            "npg",
+            "rewardtogo.policy_gradient.npg:NPG",
+            "on_policy",
+            "7",
+            "7.24",
+            ANY,
+            "natural policy gradient: conjugate gradients with Fisher-vector products",
+        ),
+        Row(
+            "trpo",
+            "rewardtogo.policy_gradient.trpo:TRPO",
+            "on_policy",
+            "7",
+            "7.26",
+            ANY,
+            "trust region policy optimisation: natural direction, line search on the KL divergence",
         ),
         Row(
             "ppo",

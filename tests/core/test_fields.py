@@ -80,7 +80,7 @@ def test_schedules_get_a_horizon_and_a_value():
     assert isinstance(now, Example)
 
 
-@pytest.mark.parametrize("learner", [rtg.PPO, rtg.DQN, rtg.REINFORCE])
+@pytest.mark.parametrize("learner", [rtg.PPO, rtg.DQN, rtg.PolicyGradient])
 def test_every_hyperparameter_is_documented(learner):
     fields = {f.name: f.metadata for f in learner.__dataclass_fields__.values()}
     assert fields

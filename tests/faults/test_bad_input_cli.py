@@ -26,7 +26,7 @@ CASES = [
     (f"{PPO} --learner.network mpl", "PPO.network 'mpl' mlp"),
     (f"{PPO} --learner.network.actvation relu", "MLP 'actvation' activation"),
     (f"{PPO} --learner.network.activation sigmod", "'sigmod' relu"),
-    ("train reinforce CartPole-v1 --learner.baseline valu", "REINFORCE.baseline 'valu' value"),
+    ("train reinforce CartPole-v1 --learner.baseline valu", "PolicyGradient.baseline 'valu' value"),
     (f"{DQN} --loop.replay uniformm", "OffPolicy.replay 'uniformm' uniformreplay"),
     (f"{PPO} --backend jaxx", "'jaxx' jax gymnasium"),
     ("train ppo CartPole-v1 --preset good", "'good' auto none ppo/CartPole-v1"),

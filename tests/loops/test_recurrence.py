@@ -101,9 +101,10 @@ def value_after(network: ActorCritic, rollout: Rollout, reset: bool) -> tuple[ja
     t = rollout.transitions
 
     def one(carry: Any, observation: jax.Array, following: jax.Array, done: jax.Array) -> tuple[jax.Array, jax.Array]:
-        after, value = network.value(carry[1], observation)
+        value = network.value(carry, observation)
+        after = network.critic(carry[1], observation)[0]
         lost = jax.tree.map(lambda fresh, old: jnp.where(done, fresh, old), network.critic.init(), after)
-        return value, network.value(lost if reset else after, following)[1]
+        return value, network.value((carry[0], lost if reset else after), following)
 
     return jit(jax.vmap(jax.vmap(one)))(t.extras["carry"], t.observation, t.next_observation, t.done)
 

@@ -7,7 +7,7 @@ import pytest
 
 from algorithms_under_test import first_gradient, jit
 from rewardtogo.core import from_space
-from rewardtogo.nn import CNN, GRU, LSTM, MLP, Adam, Custom, Linear, as_network, flatten_observation, global_norm
+from rewardtogo.nn import CNN, GRU, LSTM, MLP, Custom, Linear, Optimiser, as_network, flatten_observation, global_norm
 
 KEY = jax.random.key(0)
 VECTOR = from_space(spaces.Box(-1, 1, (3,), np.float32))
@@ -173,7 +173,7 @@ def test_adam_clips_by_the_global_norm():
     parameters = {"a": jnp.zeros(2), "b": jnp.zeros(1)}
     gradient = {"a": jnp.asarray([3.0, -4.0]), "b": jnp.asarray([12.0])}
     assert global_norm(gradient) == pytest.approx(13.0)
-    adam = Adam(0.1, 1.0, eps=0.0)
+    adam = Optimiser(0.1, 1.0, eps=0.0)
     new, state = adam.step(parameters, gradient, adam.init(parameters))
     np.testing.assert_allclose(new["a"], [-0.1, 0.1], rtol=1e-5)
     seen = first_gradient(state, parameters)

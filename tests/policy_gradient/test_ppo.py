@@ -132,7 +132,7 @@ def test_the_loss_is_the_sum_that_is_written(samples):
     loss, metrics = learner._loss(state.network, eqx.tree_at(lambda s: s.log_prob, s, s.log_prob - 0.5))
     ratio, advantage = np.exp(0.5), np.asarray(normalise(s.advantage), np.float64)
     policy = -np.minimum(ratio * advantage, 1.3 * advantage).mean()
-    value = jax.vmap(lambda o: state.network.value((), o)[1])(s.observation)
+    value = jax.vmap(lambda o: state.network.value(state.network.init(), o))(s.observation)
     square = 0.5 * np.mean((np.asarray(value, np.float64) - np.asarray(s.target)) ** 2)
     assert float(metrics["policy_loss"]) == pytest.approx(policy, rel=1e-4, abs=1e-6)
     assert float(metrics["value_loss"]) == pytest.approx(square, rel=1e-5)
@@ -142,7 +142,7 @@ def test_the_loss_is_the_sum_that_is_written(samples):
     np.testing.assert_allclose(s.target, s.advantage + value, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("network", "what"), [(small, "steps"), (lstm, "environments")])
+@pytest.mark.parametrize(("network", "what"), [(small, "steps"), (lstm, "sequences")])
 def test_too_many_minibatches_are_refused(network, what):
     learner = rtg.PPO(network=network, minibatches=99)
     loop = rtg.OnPolicy(rtg.vectorize(small_env(), 4), learner, unroll=8)

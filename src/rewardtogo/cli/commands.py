@@ -277,17 +277,17 @@ def _figure(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> Non
 
 def show_options(algorithm: str) -> None:
     """Print every hyperparameter of an algorithm and of its loop: default, range, meaning."""
-    cls = resolve(algorithm if ":" in algorithm else algorithm_row(algorithm).path)
-    loop = resolve(LOOPS[algorithm_row(algorithm).loop]) if ":" not in algorithm else None
-    for title, owner in (("learner", cls), ("loop", loop)):
-        if owner is None:
-            continue
+    row = None if ":" in algorithm else algorithm_row(algorithm)
+    parts = [("learner", resolve(algorithm if row is None else row.path), {} if row is None else row.learner)]
+    if row is not None:
+        parts.append(("loop", resolve(LOOPS[row.loop]), row.loop_options))
+    for title, owner, settings in parts:
         print(f"\n{title} ({owner.__name__}):")
         for name, field in options(owner).items():
             span = field.metadata.get("range")
             limits = f"  {span}" if span is not None and str(span) != "(-inf, inf)" else ""
             print(
-                f"  --{title}.{name.replace('_', '-')} {_shown(field.default)}{limits}\n      {field.metadata['doc']}"
+                f"  --{title}.{name.replace('_', '-')} {_shown(settings.get(name, field.default))}{limits}\n      {field.metadata['doc']}"
             )
             if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
                 for inner in options(type(field.default)):

@@ -8,6 +8,7 @@ from .files import Damaged as Damaged
 from .minari import from_minari as from_minari
 from .minari import to_minari as to_minari
 from .n_step import n_step as n_step
+from .n_step import n_step_windows as n_step_windows
 from .noise import perturb as perturb
 from .replay import ReplayState as ReplayState
 from .replay import UniformReplay as UniformReplay

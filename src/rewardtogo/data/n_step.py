@@ -35,3 +35,17 @@ def n_step(sequences: Transition, gamma: float | Float[Array, ""]) -> Transition
         )
 
     return jax.vmap(one, in_axes=1)(sequences)
+
+
+def n_step_windows(sequences: Transition, n: int, gamma: float | Float[Array, ""]) -> Transition:
+    """`n_step` from every place of sequences `[T, N]` that has n steps before it ends: `[T - n + 1, N]`.
+
+    Raises `ValueError` where the sequences are shorter than n.
+    """
+    starts = sequences.reward.shape[0] - n + 1
+    if starts < 1:
+        raise ValueError(
+            f"targets of {n} steps need sequences of at least {n} steps, not {starts + n - 1}: give the loop length={n}"
+        )
+    window = lambda start: jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, n), sequences)  # noqa: E731
+    return jax.vmap(lambda start: n_step(window(start), gamma))(jnp.arange(starts))

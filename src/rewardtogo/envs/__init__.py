@@ -5,6 +5,8 @@ from .cartpole import CartPole as CartPole
 from .check import check_env as check_env
 from .gymnasium import EnvironmentFailure as EnvironmentFailure
 from .gymnasium import GymnasiumEnv as GymnasiumEnv
+from .history import DiscreteHistory as DiscreteHistory
+from .history import History as History
 from .mountain_car import MountainCar as MountainCar
 from .mountain_car import MountainCarContinuous as MountainCarContinuous
 from .pendulum import Pendulum as Pendulum

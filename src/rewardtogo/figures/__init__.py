@@ -10,6 +10,10 @@ from ..catalogue import nearest
 FIGURES = {
     "1.1": ("markov_chain", "a Markov chain, its simulation, and where its state distribution goes"),
     "1.2": ("anatomy", "the anatomy of reinforcement learning: the three parts of the loop, and the time each takes"),
+    "7.1": (
+        "fisher_ellipse",
+        "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",
+    ),
 }
 """Number in the notes: the module here that draws it, and what it shows."""
 

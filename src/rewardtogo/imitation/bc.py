@@ -39,7 +39,7 @@ from ..data.noise import EXPERT
 from ..nn import ACTION_KINDS, MLP, Network, RunningNorm, as_network
 from ..nn.actor import ActorNetwork, StochasticPolicy
 from ..nn.heads import half_width
-from ..nn.optimise import Adam, global_norm
+from ..nn.optimise import Optimiser, global_norm
 from ..ops.distributions import Distribution
 
 
@@ -126,8 +126,8 @@ class BC(Learner):
         floor = jnp.log(self.min_std * half_width(network.head.spec))
         return eqx.tree_at(lambda n: n.head.log_std, network, jnp.maximum(network.head.log_std, floor))
 
-    def _optimiser(self) -> Adam:
-        return Adam(self.learning_rate, self.max_grad_norm)
+    def _optimiser(self) -> Optimiser:
+        return Optimiser(self.learning_rate, self.max_grad_norm)
 
 
 def explain(network: ActorNetwork, norm: RunningNorm | None, t: Transition) -> Fit:

@@ -1,7 +1,9 @@
 """Networks, heads, encoders and running normalisation."""
 
+from .actor_critic import VERSION as VERSION
 from .actor_critic import ActorCritic as ActorCritic
 from .actor_critic import ActorCriticPolicy as ActorCriticPolicy
+from .actor_critic import require_fresh as require_fresh
 from .encoding import RunningNorm as RunningNorm
 from .encoding import action_mask as action_mask
 from .encoding import flat_size as flat_size
@@ -16,9 +18,12 @@ from .network import Linear as Linear
 from .network import Network as Network
 from .network import Torso as Torso
 from .network import as_network as as_network
-from .optimise import Adam as Adam
+from .optimise import RULES as RULES
+from .optimise import Optimiser as Optimiser
 from .optimise import global_norm as global_norm
 from .recurrent import GRU as GRU
 from .recurrent import LSTM as LSTM
 from .recurrent import is_recurrent as is_recurrent
+from .recurrent import piece_length as piece_length
+from .recurrent import pieces as pieces
 from .recurrent import unroll as unroll

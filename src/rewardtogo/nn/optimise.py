@@ -1,4 +1,4 @@
-"""Gradient descent as every learner here does it: Adam on a gradient whose global norm is bounded."""
+"""Gradient descent as every learner here does it: on a gradient whose global norm is bounded, by Adam, RMSProp or plainly."""
 
 from typing import TypeVar, cast
 
@@ -13,22 +13,35 @@ from ..core import Number
 Parameters = TypeVar("Parameters")
 
 
-class Adam(eqx.Module):
-    """Adam (Kingma and Ba 2015) after clipping by the global norm. Its numbers may be traced: building it in each update is free.
+RULES = ("adam", "rmsprop", "sgd")
+"""Names of the rules an `Optimiser` can follow."""
 
-    All parameters are treated as one long vector, and so is the state: a network of a dozen small arrays is a tenth faster so.
+
+class Optimiser(eqx.Module):
+    """Clipping by the global norm, then a rule: Adam (Kingma and Ba 2015), RMSProp (Tieleman and Hinton 2012; decay 0.99, no momentum,
+    as A3C has it), or plain descent, theta - rate * gradient.
+
+    All parameters are treated as one long vector, and so is the state: a network of a dozen small arrays is a tenth faster so. Its
+    numbers may be traced: building one in each update is free.
     """
 
     rate: Number
     max_grad_norm: Number
     eps: float = 1e-8
+    rule: str = eqx.field(static=True, default="adam")
 
     def init(self, parameters: Parameters) -> optax.OptState:
         """The state before the first step; it does not depend on the numbers."""
-        return Adam(0.0, 1.0)._transformation().init(ravel_pytree(parameters)[0])
+        numbers = Optimiser(0.0, 1.0, rule=self.rule)  # a schedule has no value yet
+        return numbers._transformation().init(ravel_pytree(parameters)[0])
 
     def _transformation(self) -> optax.GradientTransformation:
-        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), optax.adam(self.rate, eps=self.eps))
+        rule = {
+            "adam": lambda: optax.adam(self.rate, eps=self.eps),
+            "rmsprop": lambda: optax.rmsprop(self.rate, decay=0.99, eps=self.eps, eps_in_sqrt=False),
+            "sgd": lambda: optax.sgd(self.rate),
+        }[self.rule]()
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), rule)
 
     def step(
         self, parameters: Parameters, gradient: Parameters, state: optax.OptState
@@ -41,5 +54,5 @@ class Adam(eqx.Module):
 
 def global_norm(tree: Parameters) -> Float[Array, ""]:
     """Euclidean norm of all the numbers in a tree."""
-    # As one vector, which `Adam` makes of it anyway: the compiler computes the norm once.
+    # As one vector, which `Optimiser` makes of it anyway: the compiler computes the norm once.
     return jnp.sqrt(jnp.sum(jnp.square(ravel_pytree(tree)[0])))

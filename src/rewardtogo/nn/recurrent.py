@@ -10,6 +10,9 @@ from jaxtyping import Array, Bool, Float
 from ..core import Carry, Observation, PRNGKey, Spec
 from .network import MLP, Linear, Network, Torso, as_network
 
+UNROLL = 4
+"""Steps per iteration of the scan over a sequence."""
+
 
 class GRU(Network):
     """`GRU(64)`: an encoder, then a gated recurrent unit of 64 numbers."""
@@ -91,9 +94,16 @@ class RecurrentTorso(Torso):
         return (zeros, zeros) if self.kind == "lstm" else (zeros, jnp.zeros(0))
 
     def __call__(self, carry: Carry, observation: Observation) -> tuple[Carry, Float[Array, "H"]]:
+        return self.remember(carry, self.read(observation))
+
+    def read(self, observation: Observation) -> Float[Array, "G"]:
+        """What an observation sends to the gates: the part of a step that needs no memory."""
+        return self.inputs(self.encoder(self.encoder.init(), observation)[1])
+
+    def remember(self, carry: Carry, mine: Float[Array, "G"]) -> tuple[Carry, Float[Array, "H"]]:
+        """The memory after what `read` gave, and the features."""
         hidden, cell = carry
-        _, x = self.encoder(self.encoder.init(), observation)
-        mine, past = self.inputs(x), self.memory @ hidden
+        past = self.memory @ hidden
         if self.kind == "lstm":
             enter, forget, leave, content = jnp.split(mine + past, 4)
             cell = jax.nn.sigmoid(forget) * cell + jax.nn.sigmoid(enter) * jnp.tanh(content)
@@ -114,15 +124,31 @@ def unroll(
     Returns the memory after each observation and before any reset, `[T, ...]` (where values of `next_observation` are taken from),
     and the features `[T, F]`. The same numbers as acting step by step.
     """
+    if isinstance(torso, RecurrentTorso):
+        # Observations are encoded all at once: only what needs the memory is done step by step.
+        read, inputs = torso.remember, jax.vmap(lambda o: torso.read(o))(observations)
+    else:
+        read, inputs = torso.__call__, observations
 
-    def step(carry: Carry, inputs: tuple[Observation, Array]) -> tuple[Carry, tuple[Carry, Array]]:
-        observation, done = inputs
-        after, features = torso(carry, observation)
+    def step(carry: Carry, now: tuple[Observation, Array]) -> tuple[Carry, tuple[Carry, Array]]:
+        given, done = now
+        after, features = read(carry, given)
         reset = jax.tree.map(lambda fresh, old: jnp.where(done, fresh, old), torso.init(), after)
         return reset, (after, features)
 
-    _, (carries, features) = jax.lax.scan(step, carry, (observations, done))
+    _, (carries, features) = jax.lax.scan(step, carry, (inputs, done), unroll=UNROLL)
     return carries, features
+
+
+def piece_length(steps: int, most: int) -> int:
+    """The longest equal pieces of at most `most` steps that a sequence can be cut into."""
+    return next(length for length in range(min(most, steps), 0, -1) if steps % length == 0)
+
+
+def pieces(x: Array, length: int) -> Array:
+    """Sequences `[T, B, ...]` cut into shorter ones, `[B * T / length, length, ...]`."""
+    steps, num = x.shape[:2]
+    return jnp.swapaxes(x, 0, 1).reshape(num * (steps // length), length, *x.shape[2:])
 
 
 def is_recurrent(torso: Torso) -> bool:

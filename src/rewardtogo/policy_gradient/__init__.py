@@ -1,0 +1,36 @@
+"""Policy gradients and trust regions: chapters 3 and 7."""
+
+from .couplings import MixtureDecomposition as MixtureDecomposition
+from .couplings import expectation_lower_bound as expectation_lower_bound
+from .couplings import kl_rows as kl_rows
+from .couplings import kl_to_tv as kl_to_tv
+from .couplings import maximal_coupling as maximal_coupling
+from .couplings import mixture_decomposition as mixture_decomposition
+from .couplings import policy_closeness as policy_closeness
+from .couplings import sample_maximal_coupling as sample_maximal_coupling
+from .couplings import separation as separation
+from .couplings import state_l1_bound as state_l1_bound
+from .couplings import tv_rows as tv_rows
+from .couplings import tv_to_kl as tv_to_kl
+from .duals import DualDescent as DualDescent
+from .duals import dual_gradient_descent as dual_gradient_descent
+from .duals import dual_kl_update as dual_kl_update
+from .duals import lagrangian as lagrangian
+from .duals import lagrangian_gradient as lagrangian_gradient
+from .theory import argmax_step as argmax_step
+from .theory import discounted_visits as discounted_visits
+from .theory import gradient_step as gradient_step
+from .theory import importance_performance_difference as importance_performance_difference
+from .theory import performance_difference as performance_difference
+from .theory import surrogate_advantage as surrogate_advantage
+from .theory import surrogate_gradient as surrogate_gradient
+from .trust_regions import KLStep as KLStep
+from .trust_regions import advantage_limit as advantage_limit
+from .trust_regions import ball_constrained_step as ball_constrained_step
+from .trust_regions import exponential_tilt as exponential_tilt
+from .trust_regions import improvement_penalty as improvement_penalty
+from .trust_regions import kl_constrained_update as kl_constrained_update
+from .trust_regions import monotone_update as monotone_update
+from .trust_regions import occupancy_kl as occupancy_kl
+from .trust_regions import return_lower_bound as return_lower_bound
+from .trust_regions import tv_constrained_update as tv_constrained_update

@@ -33,7 +33,20 @@ from ..core import (
     require_action,
     setting,
 )
-from ..nn import ACTION_KINDS, MLP, ActorCritic, ActorCriticPolicy, Adam, Network, RunningNorm, as_network, global_norm
+from ..nn import (
+    ACTION_KINDS,
+    MLP,
+    ActorCritic,
+    ActorCriticPolicy,
+    Network,
+    Optimiser,
+    RunningNorm,
+    as_network,
+    global_norm,
+    piece_length,
+    pieces,
+    require_fresh,
+)
 from ..ops.advantages import gae, normalise
 from ..ops.metrics import explained_variance
 from ..ops.shuffle import permutations
@@ -49,7 +62,7 @@ class PPOState(eqx.Module):
 
 
 class Samples(eqx.Module):
-    """What the loss looks at: single steps `[N]`, or with a memory whole sequences `[B, T]`."""
+    """What the loss looks at: single steps `[N]`, or with a memory sequences `[N, L]` and the memory `[N]` before each."""
 
     observation: Observation
     action: Action
@@ -74,7 +87,10 @@ class PPO(Learner):
     value_cost: Number = number(0.5, "c_V: weight of the value loss", at_least=0)
     max_grad_norm: Number = number(0.5, "gradients are scaled down to this global norm", above=0)
     epochs: int = setting(4, "passes over each rollout", at_least=1)
-    minibatches: int = setting(4, "gradient steps a pass; with a memory each takes whole environments", at_least=1)
+    minibatches: int = setting(4, "gradient steps a pass; with a memory each takes whole sequences", at_least=1)
+    bptt: int = setting(
+        32, "steps that gradients flow back through a memory: rollouts are cut into such pieces", at_least=1
+    )
     normalise_advantages: bool = setting(True, "mean 0, sd 1 in each minibatch")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
@@ -93,9 +109,10 @@ class PPO(Learner):
         return PPOState(network, self._optimiser().init(network), norm, jnp.zeros((), jnp.int32))
 
     def policy(self, state: PPOState, explore: bool) -> ActorCriticPolicy:
-        return ActorCriticPolicy(state.network, state.norm, explore)
+        return ActorCriticPolicy(state.network, state.norm, explore, state.updates)
 
     def update(self, state: PPOState, batch: Rollout, key: PRNGKey) -> tuple[PPOState, dict[str, Array], tuple[()]]:
+        require_fresh(batch.transitions, state.updates, "PPO")
         now = self.at(state.updates)
         samples, value = now._samples(state, batch)
         size = len(samples.log_prob)
@@ -131,8 +148,10 @@ class PPO(Learner):
         steps = Samples(observation, t.action, t.extras["log_prob"], advantage, advantage + value, t.done, ())
         if not state.network.recurrent:
             return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (steps, value))
-        steps, value = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (steps, value))
-        return eqx.tree_at(lambda s: s.carry, steps, rollout.carry), value
+        length = piece_length(len(t.reward), self.bptt)
+        carry = jax.tree.map(lambda x: pieces(x, length)[:, 0], state.network.carries(rollout, norm))
+        steps, value = jax.tree.map(lambda x: pieces(x, length), (steps, value))
+        return eqx.tree_at(lambda s: s.carry, steps, carry), value
 
     def _loss(self, network: ActorCritic, s: Samples) -> tuple[Array, dict[str, Array]]:
         log_prob, entropy, value = jax.vmap(lambda *step: network.evaluate(*step))(
@@ -154,12 +173,12 @@ class PPO(Learner):
             "clip_fraction": (jnp.abs(ratio - 1.0) > self.clip).mean(),
         }
 
-    def _optimiser(self) -> Adam:
-        return Adam(self.learning_rate, self.max_grad_norm, eps=1e-5)
+    def _optimiser(self) -> Optimiser:
+        return Optimiser(self.learning_rate, self.max_grad_norm, eps=1e-5)
 
     def _minibatch_size(self, size: int, recurrent: bool) -> int:
         if size < self.minibatches:
-            what = "environments (a memory needs whole ones)" if recurrent else "steps"
+            what = "sequences (a memory needs whole ones)" if recurrent else "steps"
             raise ValueError(
                 f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
                 f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}"

@@ -80,14 +80,11 @@ def plan(
         vector_env: VectorEnv | None = _env_of(algorithm)
     else:
         # A learner object says what it wants: a preset's values are for names.
-        known = {} if isinstance(algorithm, Learner) else ready.get("learner", {})
+        row = ALGORITHMS.get(algorithm) if isinstance(algorithm, str) else None
+        known = {} if row is None else merge(row.learner, ready.get("learner", {}))
         inner = _learner(algorithm, merge(known, learner or {}))
-        options = merge(ready.get("loop", {}), loop or {})
-        kind = (
-            algorithm_row(name).loop
-            if name in ALGORITHMS
-            else ("on_policy" if inner.batch == "rollout" else "off_policy")
-        )
+        options = merge(merge({} if row is None else row.loop_options, ready.get("loop", {})), loop or {})
+        kind = row.loop if row is not None else ("on_policy" if inner.batch == "rollout" else "off_policy")
         if data is not None:
             kind, options = "offline", loop or {}
         cls = resolve(LOOPS[kind])
@@ -107,7 +104,7 @@ def plan(
             number = (
                 num_envs
                 if num_envs is not None or not isinstance(env, (str, Environment))
-                else ready.get("num_envs", cls.default_num_envs())
+                else ready.get("num_envs", (row and row.num_envs) or cls.default_num_envs())
             )
             vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
             whole = build(cls, options, env=vector_env, learner=inner)

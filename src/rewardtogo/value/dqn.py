@@ -5,7 +5,8 @@ Minimises the Huber loss of Q(s, a) - y over batches from the replay, with
     plain   y = r + gamma (1 - terminated) max_a' Q_target(s', a')
     double  y = r + gamma (1 - terminated) Q_target(s', argmax_a' Q(s', a'))            (van Hasselt et al. 2016)
 
-and acts by epsilon-greedy choice. Every `target_period` updates the target moves: Q_target <- (1 - tau) Q_target + tau Q, a hard copy
+or with the sum of n discounted rewards and the value n steps on (`n_step`; uncorrected, so that exploration in between biases it), and
+acts by epsilon-greedy choice. Every `target_period` updates the target moves: Q_target <- (1 - tau) Q_target + tau Q, a hard copy
 where tau is 1, Polyak averaging where `target_period` is 1 and tau small. A network with a memory learns from sequences, each
 replayed from the memory that was stored when acting.
 
@@ -13,7 +14,8 @@ Deviations from the paper: Adam instead of RMSProp; the loss is Huber's (the pap
 observations are not preprocessed here.
 """
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -37,11 +39,12 @@ from ..core import (
     require_action,
     setting,
 )
+from ..data.n_step import DISCOUNT, n_step_windows
 from ..nn import (
     MLP,
-    Adam,
     Linear,
     Network,
+    Optimiser,
     RunningNorm,
     Torso,
     action_mask,
@@ -55,6 +58,13 @@ from ..ops.td import double_q_target, huber, q_target
 
 FORBIDDEN = -1e9
 """The Q value of a masked action: finite, so that nothing multiplied by 0 becomes NaN."""
+
+
+def _over(axes: int, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of one step mapped over `axes` leading axes."""
+    for _ in range(axes):
+        function = jax.vmap(function)
+    return function
 
 
 class QNetwork(eqx.Module):
@@ -80,11 +90,11 @@ class QNetwork(eqx.Module):
         return q if mask is None else jnp.where(mask > 0, q, FORBIDDEN)
 
     def along(self, t: Transition) -> tuple[Float[Array, "*N A"], Float[Array, "*N A"]]:
-        """Q at every observation and every `next_observation`: of transitions `[N]`, or with a memory of sequences `[T, N]`,
-        each from the memory that was stored with its first step.
+        """Q at every observation and every `next_observation`, of transitions `[N]` or of sequences `[T, N]`; with a memory
+        each sequence goes on from the memory that was stored with its first step.
         """
         if not is_recurrent(self.torso):
-            read = jax.vmap(lambda o: self((), o)[1])
+            read = _over(t.reward.ndim, lambda o: self((), o)[1])
             return read(t.observation), read(t.next_observation)
 
         def one(t: Transition) -> tuple[Array, Array]:
@@ -147,6 +157,7 @@ class DQN(Learner):
         1.0, "tau: how far the target moves towards the network; 1 copies it", above=0, at_most=1
     )
     target_period: int = setting(250, "updates between two moves of the target", at_least=1)
+    n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     double: bool = setting(False, "let the online network choose the action that the target network values")
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
     huber: Number = number(1.0, "errors beyond this count linearly", above=0)
@@ -154,11 +165,17 @@ class DQN(Learner):
 
     @property
     def batch(self) -> Literal["transitions", "sequences"]:
-        return "sequences" if self.network.has_memory else "transitions"
+        return "sequences" if self.network.has_memory or self.n_step > 1 else "transitions"
 
     @property
     def action_kinds(self) -> tuple[str, ...]:
         return ("discrete",)
+
+    def __check_init__(self) -> None:
+        if self.network.has_memory and self.n_step > 1:
+            raise ValueError(
+                f"n_step={self.n_step} takes steps out of their sequence, which a network with a memory needs whole: use n_step=1"
+            )
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> DQNState:
         require_action("DQN", spec, self.action_kinds)
@@ -178,28 +195,25 @@ class DQN(Learner):
         now, t = self.at(state.updates), batch.transitions
         norm = None if state.norm is None else state.norm.update(t.observation)
         if norm is not None:
-            standard = jax.vmap(norm) if self.batch == "transitions" else jax.vmap(jax.vmap(norm))
+            standard = _over(t.reward.ndim, norm)
             t = eqx.tree_at(
                 lambda t: (t.observation, t.next_observation),
                 t,
                 (standard(t.observation), standard(t.next_observation)),
             )
-
+        if self.n_step > 1:
+            t = n_step_windows(t, self.n_step, now.gamma)
+        discount = t.extras.get(DISCOUNT, now.gamma * (1.0 - t.terminated))
         by_sample = lambda x: x if x.ndim == 1 else x.mean(0)  # noqa: E731
 
         def loss(network: QNetwork) -> tuple[Array, tuple[Array, Array]]:
             q, following = network.along(t)
             _, target_following = state.target.along(t)
-            discount = now.gamma * (1.0 - t.terminated)
             # Where plain Q-learning has no use for the online values, the compiler drops their computation.
-            value_of = (
-                (lambda *a: double_q_target(*a)) if self.double else (lambda r, d, target, _: q_target(r, d, target))
-            )
-            for _ in range(t.reward.ndim):
-                value_of = jax.vmap(value_of)
-            y = jax.lax.stop_gradient(value_of(t.reward, discount, target_following, following))
+            value_of = double_q_target if self.double else lambda r, d, target, _: q_target(r, d, target)
+            y = _over(t.reward.ndim, value_of)(t.reward, discount, target_following, following)
             chosen = jnp.take_along_axis(q, t.action[..., None], -1)[..., 0]
-            error = chosen - y
+            error = chosen - jax.lax.stop_gradient(y)
             return (batch.weights * by_sample(huber(error, now.huber))).mean(), (chosen, error)
 
         (value, (chosen, error)), gradient = jax.value_and_grad(loss, has_aux=True)(state.network)
@@ -218,5 +232,5 @@ class DQN(Learner):
         }
         return DQNState(network, target, optimiser, norm, updates), metrics, by_sample(jnp.abs(error))
 
-    def _optimiser(self) -> Adam:
-        return Adam(self.learning_rate, self.max_grad_norm)
+    def _optimiser(self) -> Optimiser:
+        return Optimiser(self.learning_rate, self.max_grad_norm)

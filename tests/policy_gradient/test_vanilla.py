@@ -19,7 +19,7 @@ ENV = rtg.vectorize(small_env(), 4)
 
 def make(**options: Any) -> Any:
     common = {"network": small, "gamma": 0.95, "max_grad_norm": 1e9, "value_updates": 1, "normalise_advantages": False}
-    return rtg.REINFORCE(**{**common, **options})
+    return rtg.PolicyGradient(**{**common, **options})
 
 
 @functools.cache
