@@ -45,6 +45,35 @@ def reinforce(env: Probe) -> Algorithm:
     return rtg.OnPolicy(rtg.vectorize(env, 8), learner, unroll=8)
 
 
+def trpo(env: Probe) -> Algorithm:
+    learner = rtg.TRPO(
+        network=NETWORK, value_learning_rate=Linear(3e-2, 0.0), gamma=GAMMA, value_epochs=4, minibatches=2
+    )
+    return rtg.OnPolicy(rtg.vectorize(env, 8), learner, unroll=8)
+
+
+def asynchronous(env: Probe) -> Algorithm:
+    learner = rtg.PolicyGradient(
+        network=NETWORK,
+        returns="vtrace",
+        gae_lambda=1.0,
+        learning_rate=Linear(3e-3, 0.0),
+        value_learning_rate=Linear(3e-2, 0.0),
+        gamma=GAMMA,
+        value_updates=8,
+    )
+    return rtg.Asynchronous(rtg.vectorize(env, 8), learner, workers=3, unroll=8)
+
+
+def offpolicy_pg(env: Probe) -> Algorithm:
+    learner = rtg.OffPolicyPG(
+        network=NETWORK, learning_rate=Linear(3e-3, 0.0), value_learning_rate=Linear(3e-2, 0.0), gamma=GAMMA
+    )
+    return rtg.OffPolicy(
+        rtg.vectorize(env, 4), learner, rtg.UniformReplay(256), unroll=8, updates=2, batch_size=16, warm_up=64, length=8
+    )
+
+
 def dqn(env: Probe) -> Algorithm:
     learner = rtg.DQN(
         network=NETWORK,
@@ -63,6 +92,9 @@ def dqn(env: Probe) -> Algorithm:
 LEARNERS: dict[str, tuple[Callable[[Probe], Algorithm], int]] = {
     "ppo": (ppo, 200),
     "reinforce": (reinforce, 150),
+    "trpo": (trpo, 150),
+    "async": (asynchronous, 300),
+    "offpolicy_pg": (offpolicy_pg, 300),
     "dqn": (dqn, 200),
 }
 """Every learner that bootstraps, and iterations enough for a probe. A new one adds a row."""

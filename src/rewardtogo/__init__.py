@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .actor_critic.asynchronous import Asynchronous as Asynchronous
     from .core import Algorithm as Algorithm
     from .core import Batch as Batch
     from .core import Configured as Configured
@@ -44,7 +45,10 @@ if TYPE_CHECKING:
     from .nn.network import MLP as MLP
     from .nn.recurrent import GRU as GRU
     from .nn.recurrent import LSTM as LSTM
+    from .policy_gradient.npg import NPG as NPG
+    from .policy_gradient.off_policy import OffPolicyPG as OffPolicyPG
     from .policy_gradient.ppo import PPO as PPO
+    from .policy_gradient.trpo import TRPO as TRPO
     from .policy_gradient.vanilla import PolicyGradient as PolicyGradient
     from .runner.engine import Every as Every
     from .runner.engine import Moment as Moment
@@ -57,6 +61,7 @@ if TYPE_CHECKING:
     from .value.dqn import DQN as DQN
 
 _HOMES = {
+    "actor_critic.asynchronous": "Asynchronous",
     "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
     "number part setting",
     "data.replay": "UniformReplay",
@@ -70,7 +75,10 @@ _HOMES = {
     "loops.on_policy": "OnPolicy",
     "nn.network": "CNN MLP",
     "nn.recurrent": "GRU LSTM",
+    "policy_gradient.npg": "NPG",
+    "policy_gradient.off_policy": "OffPolicyPG",
     "policy_gradient.ppo": "PPO",
+    "policy_gradient.trpo": "TRPO",
     "policy_gradient.vanilla": "PolicyGradient",
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
@@ -79,6 +87,7 @@ _HOMES = {
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (
+    "actor_critic",
     "core",
     "data",
     "envs",

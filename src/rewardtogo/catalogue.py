@@ -61,6 +61,18 @@ ALGORITHMS: dict[str, Row] = {
             {"returns": "gae"},
         ),
         Row(
+            "offpolicy_pg",
+            "rewardtogo.policy_gradient.off_policy:OffPolicyPG",
+            "off_policy",
+            "3",
+            "3.9",
+            ANY,
+            "policy gradient from older policies' actions, by importance sampling",
+            {},
+            {"unroll": 64, "updates": 8, "batch_size": 32, "length": 32, "warm_up": 1, "replay": {"capacity": 4096}},
+            8,
+        ),
+        Row(
             "batch_ac",
             _VANILLA,
             "on_policy",
@@ -109,6 +121,23 @@ ALGORITHMS: dict[str, Row] = {
             8,
         ),
         Row(
+            "async_ac",
+            _VANILLA,
+            "asynchronous",
+            "4",
+            "4.7",
+            ANY,
+            "asynchronous actor-critic: workers with parameters of different ages, corrected by V-trace",
+            {
+                "returns": "vtrace",
+                "gae_lambda": 1.0,
+                "value_updates": 1,
+                "learning_rate": 3e-4,
+                "value_learning_rate": 1e-3,
+            }
+            | {"normalise_advantages": False, "max_grad_norm": 0.5},
+        ),
+        Row(
             "npg",
             "rewardtogo.policy_gradient.npg:NPG",
             "on_policy",
@@ -151,6 +180,7 @@ LOOPS = {
     "on_policy": "rewardtogo.loops.on_policy:OnPolicy",
     "off_policy": "rewardtogo.loops.off_policy:OffPolicy",
     "offline": "rewardtogo.loops.offline:Offline",
+    "asynchronous": "rewardtogo.actor_critic.asynchronous:Asynchronous",
 }
 
 ENVIRONMENTS: dict[str, str] = {

@@ -59,6 +59,26 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "max_grad_norm": 100.0,
         },
     },
+    ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
+    ("trpo", "Pendulum-v1"): {
+        "steps": 300_000,
+        "num_envs": 4,
+        "loop": {"unroll": 256},
+        "learner": {"gamma": 0.9, "target_kl": 0.02, "value_epochs": 20},
+    },
+    ("npg", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
+    ("npg", "Pendulum-v1"): {
+        "steps": 200_000,
+        "num_envs": 4,
+        "loop": {"unroll": 256},
+        "learner": {"gamma": 0.9, "kl_step": 0.02, "value_epochs": 20},
+    },
+    ("offpolicy_pg", "CartPole-v1"): {"steps": 200_000},
+    ("vpg", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
+    ("batch_ac", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
+    ("online_ac", "CartPole-v1"): {"steps": 300_000},
+    ("a2c", "CartPole-v1"): {"steps": 300_000},
+    ("async_ac", "CartPole-v1"): {"steps": 300_000},
     ("reinforce", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
 }
 """Keys are the algorithm's name and the environment's id."""

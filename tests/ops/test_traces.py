@@ -33,7 +33,9 @@ def stream(seed, states=None):
 
 
 def apart(one, other):
-    return max(float(jnp.max(jnp.abs(a - b))) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+    return max(
+        float(jnp.max(jnp.abs(a - b))) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    )
 
 
 def plain_forward(e, lambda_):
@@ -65,7 +67,10 @@ def test_forward_and_backward_view_agree(item, x64):
         e, states = stream(seed), stream(seed, states=4)
         for lambda_ in (0.0, 0.3, 0.9, 1.0):
             backward, forward = (view(weights(), e, lambda_) for view in views)
-            worst, by_hand = max(worst, apart(backward, forward)), max(by_hand, apart(backward, plain_forward(e, lambda_)))
+            worst, by_hand = (
+                max(worst, apart(backward, forward)),
+                max(by_hand, apart(backward, plain_forward(e, lambda_))),
+            )
             values = jnp.arange(4.0)
             tabular = max(tabular, apart(*(view(values, states, lambda_) for view in for_table)))
         one = max(one, apart(views[0](weights(), e, 1.0), monte_carlo(e)))
@@ -116,7 +121,9 @@ def test_online_updates(item, x64):
         far.append(apart(moved, offline))
     with item("4.35") as check:
         check(worst, "<=", 1e-12, "online: w after 25 steps against the update written out, lambda 0, .8, 1")
-        check(abs(far[0] / far[1] - 10), "<=", 0.5, "online from offline: of first order in alpha, ratio 10 at alpha / 10")
+        check(
+            abs(far[0] / far[1] - 10), "<=", 0.5, "online from offline: of first order in alpha, ratio 10 at alpha / 10"
+        )
 
 
 def test_a_stream_may_come_in_pieces_and_ends_empty_the_trace(x64):

@@ -79,7 +79,10 @@ def test_one_step_without_clipping_is_the_policy_gradient():
     assert relative_gap(first_gradient(new.optimiser, state.network), expected) <= 1e-6
     assert (
         relative_gap(
-            jit(jax.grad(lambda n: PLAIN._loss(n, PLAIN._samples(state, rollout)[0])[0]))(state.network), expected
+            jit(jax.grad(lambda n: PLAIN._loss(n, PLAIN._samples(state, rollout)[0], state.multiplier)[0]))(
+                state.network
+            ),
+            expected,
         )
         <= 1e-6
     )
@@ -116,7 +119,7 @@ def test_a_ratio_beyond_the_clip_has_no_gradient(samples):
         changed = eqx.tree_at(
             lambda s: (s.log_prob, s.advantage), s, (s.log_prob - shift, jnp.full_like(s.advantage, advantage))
         )
-        found = jax.grad(lambda n: learner._loss(n, changed)[0])(state.network)
+        found = jax.grad(lambda n: learner._loss(n, changed, jnp.ones(()))[0])(state.network)
         return max(float(jnp.abs(g).max(initial=0)) for g in jax.tree.leaves(found))
 
     assert gradient(0.5, 1.0) == 0.0  # too likely already, and good
@@ -129,7 +132,7 @@ def test_a_ratio_beyond_the_clip_has_no_gradient(samples):
 def test_the_loss_is_the_sum_that_is_written(samples):
     state, s = samples
     learner = rtg.PPO(network=small, clip=0.3, value_cost=0.7, entropy_cost=0.2)
-    loss, metrics = learner._loss(state.network, eqx.tree_at(lambda s: s.log_prob, s, s.log_prob - 0.5))
+    loss, metrics = learner._loss(state.network, eqx.tree_at(lambda s: s.log_prob, s, s.log_prob - 0.5), jnp.ones(()))
     ratio, advantage = np.exp(0.5), np.asarray(normalise(s.advantage), np.float64)
     policy = -np.minimum(ratio * advantage, 1.3 * advantage).mean()
     value = jax.vmap(lambda o: state.network.value(state.network.init(), o))(s.observation)

@@ -5,15 +5,21 @@ import pytest
 from theory_problems import drifting, problems
 
 from rewardtogo.envs.tabular_problems import random_mdp, random_policy
-from rewardtogo.exact import discounted_occupancy, expected_return, greedy_policy, q_values, state_distributions
-from rewardtogo.policy_gradient.theory import (
+from rewardtogo.exact import (
     advantage_values,
+    discounted_occupancy,
+    expected_return,
+    greedy_policy,
+    q_values,
+    softmax_policy,
+    state_distributions,
+)
+from rewardtogo.policy_gradient.theory import (
     argmax_step,
     discounted_visits,
     gradient_step,
     importance_performance_difference,
     performance_difference,
-    softmax_policy,
     surrogate_advantage,
     surrogate_gradient,
 )

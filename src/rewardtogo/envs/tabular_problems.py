@@ -1,6 +1,6 @@
-"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, a corridor of aliased states.
+"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, a corridor of aliased states, a random walk.
 
-Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), example 13.1 (the corridor);
+Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), examples 7.1 (the walk) and 13.1 (the corridor);
 Singh, Jaakkola and Jordan (1994) on why a memoryless policy may have to be stochastic there.
 """
 
@@ -125,3 +125,21 @@ def aliased_corridor(*, discount: float = 1.0, horizon: int | None = None) -> PO
     transitions[3, :, 3] = 1
     goal = np.arange(4) == 3
     return POMDP(MDP(transitions, -np.ones((4, 2)), 0, discount, goal, horizon), np.ones((4, 1)))
+
+
+def random_walk(num_states: int = 19) -> MDP:
+    """States 1 to `num_states` in a row, a terminal one at either end: reward -1 for the left one, +1 for the right one.
+
+    Actions are a step left (0) and right (1), the start is in the middle. Under the uniform policy
+    V(s) = 2 s / (num_states + 1) - 1, and an episode from the middle of 19 takes 100 steps in the mean. Raises
+    `ValueError` without a state to start in.
+    """
+    if num_states < 1:
+        raise ValueError(f"a walk over {num_states} states has nowhere to start: give at least 1")
+    last = num_states + 1
+    transitions, rewards = np.zeros((last + 1, 2, last + 1)), np.zeros((last + 1, 2))
+    for state in range(1, last):
+        transitions[state, 0, state - 1] = transitions[state, 1, state + 1] = 1
+    transitions[[0, last], :, [0, last]] = 1
+    rewards[1, 0], rewards[num_states, 1] = -1, 1
+    return MDP(transitions, rewards, last // 2, 1.0, np.isin(np.arange(last + 1), (0, last)))

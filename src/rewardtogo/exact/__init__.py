@@ -30,6 +30,7 @@ from .estimators import optimal_baselines as optimal_baselines
 from .estimators import step_moments as step_moments
 from .estimators import subtract_batch_mean as subtract_batch_mean
 from .estimators import subtract_others_mean as subtract_others_mean
+from .estimators import weights_of as weights_of
 from .gradients import PolicyReturn as PolicyReturn
 from .gradients import expected_gradient as expected_gradient
 from .gradients import fisher_matrix as fisher_matrix

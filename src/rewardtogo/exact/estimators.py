@@ -16,10 +16,12 @@ Source: notes, sections 3.7, 4.1, 4.2 and 4.8.
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..envs.tabular import MDP, POMDP
+from ..ops.estimators import Estimator, Steps
 from .observed import enumerate_observed
 from .signals import total_returns
 from .softmax import gradient_samples, softmax_policy
@@ -80,6 +82,42 @@ def estimator_moments(
     every, log_probs = enumerate_observed(problem, softmax_policy(logits) if behaviour is None else behaviour, horizon)
     samples = gradient_samples(logits, every, weights(every)) - baseline * gradient_samples(logits, every)
     return moments(samples, log_probs)
+
+
+def weights_of(estimator: Estimator, values: Float[Array | np.ndarray, "... S"] | None = None) -> Weights:
+    """Ψ as a learner forms it: the exact moments of what `PolicyGradient(...).estimator` trains with.
+
+    `values` is the table of V, `[S]` or `[T + 1, S]`, and 0 where it is left out. Raises `ValueError` for a baseline that is
+    made of a batch, which has no meaning for one trajectory: see `batch_moments`.
+    """
+    if estimator.baseline not in ("none", "value"):
+        raise ValueError(
+            f"the {estimator.baseline} baseline depends on the other trajectories of a batch: use batch_moments with "
+            "subtract_batch_mean or subtract_others_mean, or optimal_baselines"
+        )
+
+    def weights(trajectories: Trajectories) -> np.ndarray:
+        reward, taken = np.asarray(trajectories.rewards), np.asarray(trajectories.taken)
+        number, steps = reward.shape
+        last = np.arange(steps)[None] == np.asarray(trajectories.lengths)[:, None] - 1
+        terminated = last & np.asarray(trajectories.terminated)[:, None]
+        cut = last & (np.asarray(trajectories.terminated) | np.asarray(trajectories.truncated))[:, None]
+        table = np.zeros((steps + 1, 1)) if values is None else np.asarray(values, np.float64)
+        states = np.zeros((number, steps + 1), int) if values is None else np.asarray(trajectories.observations)
+        table = np.broadcast_to(table, (steps + 1, table.shape[-1]))
+        value = table[np.arange(steps + 1), states]
+        arrays = (
+            reward,
+            float(estimator.gamma) * (1.0 - terminated),
+            cut,
+            value[:, :-1],
+            value[:, 1:],
+            np.ones_like(reward),
+        )
+        seen = Steps(*(jnp.asarray(x.T) for x in arrays), jnp.zeros(number, jnp.int32))
+        return np.where(taken, np.asarray(estimator.weights(seen)).T, 0.0)
+
+    return weights
 
 
 def step_moments(

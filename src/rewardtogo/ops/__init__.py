@@ -19,12 +19,16 @@ from .divergences import l1_distance as l1_distance
 from .divergences import survival as survival
 from .divergences import survival_bound as survival_bound
 from .divergences import tv_distance as tv_distance
+from .estimators import Estimator as Estimator
+from .estimators import Steps as Steps
 from .importance import effective_sample_size as effective_sample_size
 from .importance import importance_mean as importance_mean
 from .importance import importance_weights as importance_weights
 from .importance import log_ratio as log_ratio
 from .importance import normalised_weights as normalised_weights
 from .importance import self_normalised_mean as self_normalised_mean
+from .linalg import conjugate_gradients as conjugate_gradients
+from .linalg import inner as inner
 from .returns import lambda_returns as lambda_returns
 from .returns import n_step_returns as n_step_returns
 from .returns import reward_to_go as reward_to_go
@@ -40,3 +44,4 @@ from .td import huber as huber
 from .td import n_step_transition as n_step_transition
 from .td import q_target as q_target
 from .td import td_error as td_error
+from .vtrace import vtrace as vtrace

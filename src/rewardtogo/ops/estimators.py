@@ -7,7 +7,8 @@ $$g = \text{mean}_{i,t}\; w_t\, \nabla \log \pi(a_t|s_t)\, (\hat R_t - b_t),$$
 and differs from the others in three choices:
 
 - $\hat R_t$, `returns`: `full`, all rewards of the trajectory (3.2); `reward_to_go` (3.7.1); `n_step` (4.9, erratum E4.9); `gae`, the
-  lambda-return (erratum E4.10).
+  lambda-return (erratum E4.10); `vtrace`, the lambda-return corrected for actions of an older policy, whose weight is also multiplied
+  by min(1, pi / mu) (4.7).
 - $b_t$, `baseline`: `none`; `mean` of the batch (biased by 1 - 1/N, erratum E3.5); `leave_one_out` (unbiased); `time_mean` (4.2);
   `value`, V(s_t); `optimal` and `optimal_per_parameter` (3.7.3, erratum E3.6).
 - $w_t$, `discount_states`: 1, which is discount option 1, or $\gamma^t$, option 2, the gradient of the discounted objective (E4.5, E4.6).
@@ -26,8 +27,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..core import Configured, Number, number, setting
 from .returns import lambda_returns, n_step_returns
+from .vtrace import vtrace
 
-Returns = Literal["full", "reward_to_go", "n_step", "gae"]
+Returns = Literal["full", "reward_to_go", "n_step", "gae", "vtrace"]
 Baseline = Literal["none", "mean", "leave_one_out", "time_mean", "value", "optimal", "optimal_per_parameter"]
 RETURNS: tuple[str, ...] = get_args(Returns)
 BASELINES: tuple[str, ...] = get_args(Baseline)
@@ -39,6 +41,7 @@ class Steps(eqx.Module):
     - `discount`: gamma (1 - terminated);
     - `cut`: terminated or truncated;
     - `value`, `next_value`: V of where the action was chosen and of where it led, before any reset;
+    - `ratio`: pi / mu of the action, 1 where the policy that acted is the one that learns;
     - `elapsed` `[B]`: steps that the first trajectory of each environment had made before.
     """
 
@@ -47,6 +50,7 @@ class Steps(eqx.Module):
     cut: Bool[Array, "T B"]
     value: Float[Array, "T B"]
     next_value: Float[Array, "T B"]
+    ratio: Float[Array, "T B"]
     elapsed: Int[Array, "B"]
 
     @property
@@ -60,12 +64,12 @@ class Steps(eqx.Module):
     def time(self) -> Int[Array, "T B"]:
         """t: steps since the episode began."""
         start = self.start
-        return jnp.arange(len(self.reward))[:, None] - start + jnp.where(start == 0, self.elapsed, 0)
+        return jnp.arange(len(self.reward))[:, None] - start + jnp.where(start == 0, self.elapsed[None], 0)
 
     @property
     def trajectory(self) -> Int[Array, "T B"]:
         """A number for each trajectory, less than T B."""
-        return self.start * self.reward.shape[1] + jnp.arange(self.reward.shape[1])
+        return self.start * self.reward.shape[1] + jnp.arange(self.reward.shape[1])[None]
 
 
 class Estimator(Configured):
@@ -75,7 +79,9 @@ class Estimator(Configured):
     baseline: Baseline = setting("value", "what is subtracted from them", choices=BASELINES)
     discount_states: bool = setting(False, "weigh step t by gamma^t: discount option 2")
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
-    gae_lambda: Number = number(0.95, "chance of looking one step further, for `gae`", at_least=0, at_most=1)
+    gae_lambda: Number = number(
+        0.95, "chance of looking one step further, for `gae` and `vtrace`", at_least=0, at_most=1
+    )
     n_steps: int = setting(5, "rewards in a return, for `n_step`", at_least=1)
 
     def weights(self, steps: Steps) -> Float[Array, "T B"]:
@@ -100,7 +106,7 @@ class Estimator(Configured):
             returns = jax.ops.segment_max(returns, rows, len(rows))
             returns = jnp.where(jnp.isfinite(returns), returns, 0.0)
         b = optimal_baseline(scores, returns, per_parameter=self.baseline == "optimal_per_parameter")
-        return (scores * (returns[:, None] - b)).sum(0) / steps.reward.size
+        return (scores * (returns[:, None] - jnp.atleast_1d(b)[None])).sum(0) / steps.reward.size
 
     def estimated_returns(self, steps: Steps) -> Float[Array, "T B"]:
         """R_t, before a baseline."""
@@ -108,17 +114,26 @@ class Estimator(Configured):
         if self.returns == "n_step":
             of = lambda r, d, v, c: n_step_returns(r, d, v, self.n_steps, c)  # noqa: E731
             return jax.vmap(of, 1, 1)(s.reward, s.discount, s.next_value, s.cut)
+        if self.returns == "vtrace":
+            return self.corrected(s)[1]
         lambda_ = self.gae_lambda if self.returns == "gae" else 1.0
         returns = jax.vmap(lambda r, d, v, c: lambda_returns(r, d, v, lambda_, c), 1, 1)(
             s.reward, s.discount, s.next_value, s.cut
         )
         return jnp.take_along_axis(returns, s.start, 0) if self.returns == "full" else returns
 
+    def corrected(self, steps: Steps) -> tuple[Float[Array, "T B"], Float[Array, "T B"]]:
+        """V-trace: targets for V, and the returns whose advantages the policy follows."""
+        s = steps
+        of = lambda r, d, v, n, p, c: vtrace(r, d, v, n, p, self.gae_lambda, c)  # noqa: E731
+        return jax.vmap(of, 1, 1)(s.reward, s.discount, s.value, s.next_value, s.ratio, s.cut)
+
     def state_weights(self, steps: Steps) -> Float[Array, "T B"]:
-        """w_t: 1, or gamma^t."""
+        """w_t: 1 or gamma^t, times min(1, pi / mu) for `vtrace`."""
+        weight = jnp.minimum(steps.ratio, 1.0) if self.returns == "vtrace" else jnp.ones_like(steps.reward)
         if not self.discount_states:
-            return jnp.ones_like(steps.reward)
-        return jnp.asarray(self.gamma, steps.reward.dtype) ** steps.time.astype(steps.reward.dtype)
+            return weight
+        return weight * jnp.asarray(self.gamma, steps.reward.dtype) ** steps.time.astype(steps.reward.dtype)
 
     def _baseline(self, steps: Steps, returns: Float[Array, "T B"]) -> Array:
         if self.baseline == "none":

@@ -56,7 +56,7 @@ def no_trace(parameters: Parameters) -> Parameters:
 def traced_change(
     value: Value[Parameters], parameters: Parameters, trace: Parameters, step: Experience, lambda_: ScalarLike
 ) -> tuple[Parameters, Parameters]:
-    """delta e of one step, and the trace that the next step begins with, gamma lambda e: 0 after a cut."""
+    """What one step adds, delta e, and the trace that the next step begins with, gamma lambda e: 0 after a cut."""
     v, slope = jax.value_and_grad(value)(parameters, step.observation)
     delta = step.r + step.discount * value(parameters, step.next_observation) - v
     trace = jax.tree.map(jnp.add, trace, slope)

@@ -1,10 +1,16 @@
-"""PPO: proximal policy optimisation with a clipped surrogate (chapter 7; Schulman et al. 2017).
+"""PPO: proximal policy optimisation (chapter 7; Schulman et al. 2017), clipped or with a penalty on the KL divergence.
 
 Maximises, over a few epochs on the same rollout of the policy pi_old,
 
     E[min(rho A, clip(rho, 1 - eps, 1 + eps) A)] + c_H E[H(pi)] - c_V E[1/2 (V - y)^2],      rho = pi(a|s) / pi_old(a|s),
 
-with A from GAE (item 4.33) and y = A + V. `terminated` ends a return, `truncated` bootstraps from `next_observation` (erratum E1.5).
+or with E[rho A] - lambda E[KL(pi_old || pi)] for its first term (7.2.3). There lambda is doubled and halved to keep the divergence within a
+factor of 1.5 of eps (`adaptive_kl`), or is the multiplier of dual gradient descent (`dual_kl`, with the projection of erratum E7.7),
+
+    lambda <- max(0, lambda + alpha (KL - eps)),
+
+the KL estimated by the mean of rho - 1 - log rho, which is never negative. A is from GAE (item 4.33) and y = A + V. `terminated` ends
+a return, `truncated` bootstraps from `next_observation` (erratum E1.5).
 
 Deviations from the paper, as is now usual: advantages are normalised in each minibatch, gradients are clipped by their global norm,
 actor and critic are two networks with orthogonal initialisation (Andrychowicz et al. 2021), Adam's epsilon is 1e-5. The remainder
@@ -53,11 +59,12 @@ from ..ops.shuffle import permutations
 
 
 class PPOState(eqx.Module):
-    """Networks, optimiser, what observations look like, and the number of updates done."""
+    """Networks, optimiser, what observations look like, the weight of the KL penalty, and the number of updates done."""
 
     network: ActorCritic
     optimiser: optax.OptState
     norm: RunningNorm | None
+    multiplier: Float[Array, ""]
     updates: Int[Array, ""]
 
 
@@ -82,6 +89,12 @@ class PPO(Learner):
     gae_lambda: Number = number(
         0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1
     )
+    objective: Literal["clip", "adaptive_kl", "dual_kl"] = setting(
+        "clip", "what keeps the policy near the old one", choices=("clip", "adaptive_kl", "dual_kl")
+    )
+    target_kl: Number = number(0.01, "eps: KL divergence that a penalty aims at", above=0)
+    multiplier: Number = number(1.0, "lambda: the penalty's weight in the beginning", at_least=0)
+    dual_rate: Number = number(0.5, "alpha eps: step of dual gradient descent, for a divergence of twice eps", above=0)
     clip: Number = number(0.2, "eps: how far the ratio may move before its gradient is cut", above=0)
     entropy_cost: Number = number(0.0, "c_H: weight of the entropy bonus", at_least=0)
     value_cost: Number = number(0.5, "c_V: weight of the value loss", at_least=0)
@@ -106,7 +119,8 @@ class PPO(Learner):
         require_action("PPO", spec, self.action_kinds)
         network = ActorCritic.of(self.network, spec, key)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
-        return PPOState(network, self._optimiser().init(network), norm, jnp.zeros((), jnp.int32))
+        multiplier = jnp.asarray(self.at(0).multiplier, jnp.float32)
+        return PPOState(network, self._optimiser().init(network), norm, multiplier, jnp.zeros((), jnp.int32))
 
     def policy(self, state: PPOState, explore: bool) -> ActorCriticPolicy:
         return ActorCriticPolicy(state.network, state.norm, explore, state.updates)
@@ -123,7 +137,7 @@ class PPO(Learner):
         ) -> tuple[tuple[ActorCritic, optax.OptState], dict[str, Array]]:
             network, optimiser = loop
             chosen = jax.tree.map(lambda x: x[rows], samples)
-            gradient, metrics = jax.grad(now._loss, has_aux=True)(network, chosen)
+            gradient, metrics = jax.grad(now._loss, has_aux=True)(network, chosen, state.multiplier)
             return now._optimiser().step(network, gradient, optimiser), metrics | {"grad_norm": global_norm(gradient)}
 
         used = self.minibatches * per_minibatch
@@ -133,7 +147,19 @@ class PPO(Learner):
         # Statistics change after the update, so that the ratio starts at exactly 1.
         norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
         metrics = jax.tree.map(jnp.mean, metrics) | {"explained_variance": explained_variance(value, samples.target)}
-        return PPOState(network, optimiser, norm, state.updates + 1), metrics, ()
+        multiplier = state.multiplier
+        if self.objective != "clip":
+            kl = now._loss(network, samples, multiplier)[1]["approx_kl"]
+            multiplier = now._next_multiplier(multiplier, kl)
+            metrics |= {"kl": kl, "multiplier": multiplier}
+        return PPOState(network, optimiser, norm, multiplier, state.updates + 1), metrics, ()
+
+    def _next_multiplier(self, multiplier: Float[Array, ""], kl: Float[Array, ""]) -> Float[Array, ""]:
+        """Lambda for the next rollout, from the divergence that this one's led to."""
+        if self.objective == "dual_kl":
+            return jnp.maximum(0.0, multiplier + self.dual_rate * (kl / self.target_kl - 1.0))
+        factor = jnp.where(kl > 1.5 * self.target_kl, 2.0, jnp.where(kl < self.target_kl / 1.5, 0.5, 1.0))
+        return jnp.clip(multiplier * factor, 1e-6, 1e6)
 
     def _samples(self, state: PPOState, rollout: Rollout) -> tuple[Samples, Float[Array, "..."]]:
         """Advantages and targets of a rollout, arranged as the loss takes them; and the old values, likewise."""
@@ -153,15 +179,19 @@ class PPO(Learner):
         steps, value = jax.tree.map(lambda x: pieces(x, length), (steps, value))
         return eqx.tree_at(lambda s: s.carry, steps, carry), value
 
-    def _loss(self, network: ActorCritic, s: Samples) -> tuple[Array, dict[str, Array]]:
+    def _loss(self, network: ActorCritic, s: Samples, multiplier: Float[Array, ""]) -> tuple[Array, dict[str, Array]]:
         log_prob, entropy, value = jax.vmap(lambda *step: network.evaluate(*step))(
             s.carry, s.observation, s.action, s.done
         )
         advantage = normalise(s.advantage) if self.normalise_advantages else s.advantage
         log_ratio = log_prob - s.log_prob
         ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1.0 - self.clip, 1.0 + self.clip)
-        policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
+        kl = (ratio - 1.0 - log_ratio).mean()
+        if self.objective == "clip":
+            clipped = jnp.clip(ratio, 1.0 - self.clip, 1.0 + self.clip)
+            policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
+        else:
+            policy_loss = -(ratio * advantage).mean() + multiplier * kl
         value_loss = 0.5 * ((value - s.target) ** 2).mean()
         entropy = entropy.mean()
         loss = policy_loss + self.value_cost * value_loss - self.entropy_cost * entropy
@@ -169,7 +199,7 @@ class PPO(Learner):
             "policy_loss": policy_loss,
             "value_loss": value_loss,
             "entropy": entropy,
-            "approx_kl": (ratio - 1.0 - log_ratio).mean(),
+            "approx_kl": kl,
             "clip_fraction": (jnp.abs(ratio - 1.0) > self.clip).mean(),
         }
 

@@ -101,7 +101,7 @@ class PolicyGradient(Learner):
     learning_rate: Number = number(3e-3, "step size for the policy (with a shared torso, for all)", above=0)
     optimiser: str = setting("adam", "rule of the steps", choices=RULES)
     value_target: Literal["mc", "td", "td_lambda"] = setting(
-        "mc", "what V is fitted to", choices=("mc", "td", "td_lambda")
+        "mc", "what V is fitted to, unless `returns` is `vtrace`, which says it", choices=("mc", "td", "td_lambda")
     )
     value_learning_rate: Number = number(3e-3, "step size for the value function", above=0)
     value_updates: int = setting(20, "gradient steps of the value regression on each rollout", at_least=1)
@@ -162,19 +162,22 @@ class PolicyGradient(Learner):
         self, state: PolicyGradientState, batch: Rollout, key: PRNGKey
     ) -> tuple[PolicyGradientState, dict[str, Array], tuple[()]]:
         del key
-        require_fresh(batch.transitions, state.updates, "PolicyGradient")
-        now, norm = self.at(state.updates), (lambda x: x) if state.norm is None else state.norm
-        carry, elapsed = (
-            batch.carry if self._needs_time else (batch.carry, jnp.zeros(batch.transitions.reward.shape[1], jnp.int32))
-        )
-        rollout = Rollout(batch.transitions, carry)
-        t = rollout.transitions
+        if self.returns != "vtrace":
+            require_fresh(batch.transitions, state.updates, "PolicyGradient")
+        now = self.at(state.updates)
+        norm = (lambda x: x) if state.norm is None else state.norm
+        t = batch.transitions
+        elapsed = batch.carry[1] if self._needs_time else jnp.zeros(t.reward.shape[1], jnp.int32)
+        rollout = Rollout(t, batch.carry[0] if self._needs_time else batch.carry)
         standard = eqx.tree_at(lambda r: r.transitions.observation, rollout, jax.vmap(jax.vmap(norm))(t.observation))
+        # How much likelier the actions have become since they were chosen: not at all, unless the parameters that acted were old.
+        log_ratio = evaluate(state.network, standard)[0] - t.extras["log_prob"] if self.returns == "vtrace" else None
+        ratio = jnp.ones_like(t.reward) if log_ratio is None else jnp.exp(log_ratio)
 
         def look(network: ActorCritic) -> Steps:
             value, next_value = network.values(rollout, norm)
             next_value = next_value if self.bootstrap else jnp.where(_ends(t.done), 0.0, next_value)
-            return Steps(t.reward, now.gamma * (1.0 - t.terminated), t.done, value, next_value, elapsed)
+            return Steps(t.reward, now.gamma * (1.0 - t.terminated), t.done, value, next_value, ratio, elapsed)
 
         steps = look(state.network)
         target, optimisers = now._targets(steps), (state.policy_optimiser, state.value_optimiser)
@@ -189,12 +192,16 @@ class PolicyGradient(Learner):
             network, value_state, value_loss = now._fit(network, optimisers[1], standard, target)
             optimisers, metrics = (policy_state, value_state), metrics | {"value_loss": value_loss}
         # Statistics change after the update, so that every part of it saw the same observations.
-        norm = None if state.norm is None else state.norm.update(t.observation)
+        statistics = None if state.norm is None else state.norm.update(t.observation)
         metrics |= {"explained_variance": explained_variance(steps.value, target)}
-        return PolicyGradientState(network, *optimisers, norm, state.updates + 1), metrics, ()
+        if log_ratio is not None:
+            metrics |= {"behaviour_kl": -log_ratio.mean(), "largest_ratio": ratio.max()}
+        return PolicyGradientState(network, *optimisers, statistics, state.updates + 1), metrics, ()
 
     def _targets(self, s: Steps) -> Float[Array, "T B"]:
         """What V is fitted to."""
+        if self.returns == "vtrace":
+            return self.estimator.corrected(s)[0]
         lambda_ = {"mc": 1.0, "td": 0.0, "td_lambda": self.gae_lambda}[self.value_target]
         return jax.vmap(lambda r, d, v, c: lambda_returns(r, d, v, lambda_, c), 1, 1)(
             s.reward, s.discount, s.next_value, s.cut
@@ -216,17 +223,8 @@ class PolicyGradient(Learner):
     def _fit(
         self, network: ActorCritic, optimiser: optax.OptState, rollout: Rollout, target: Float[Array, "T B"]
     ) -> tuple[ActorCritic, optax.OptState, Float[Array, ""]]:
-        """Steps of the value regression, and the loss before them."""
-
-        def step(
-            loop: tuple[ActorCritic, optax.OptState], _: None
-        ) -> tuple[tuple[ActorCritic, optax.OptState], Float[Array, ""]]:
-            network, optimiser = loop
-            loss, gradient = jax.value_and_grad(lambda n: _value_loss(evaluate(n, rollout), target))(network)
-            return self._optimiser(self.value_learning_rate).step(network, gradient, optimiser), loss
-
-        (network, optimiser), losses = jax.lax.scan(step, (network, optimiser), None, self.value_updates)
-        return network, optimiser, losses[0]
+        rule = self._optimiser(self.value_learning_rate)
+        return regress(network, optimiser, rule, rollout, target, self.value_updates)
 
     def _both(
         self,
@@ -290,6 +288,27 @@ def evaluate(network: ActorCritic, rollout: Rollout) -> tuple[Array, Array, Arra
     return jax.vmap(jax.vmap(lambda o, a, d: network.evaluate(network.init(), o, a, d)))(
         t.observation, t.action, t.done
     )
+
+
+def regress(
+    network: ActorCritic,
+    optimiser: optax.OptState,
+    rule: Optimiser,
+    rollout: Rollout,
+    target: Float[Array, "T B"],
+    steps: int,
+) -> tuple[ActorCritic, optax.OptState, Float[Array, ""]]:
+    """Steps of the regression of V on targets: network, optimiser, and the loss before them. The actor stays as it is, to the bit."""
+
+    def step(
+        loop: tuple[ActorCritic, optax.OptState], _: None
+    ) -> tuple[tuple[ActorCritic, optax.OptState], Float[Array, ""]]:
+        network, optimiser = loop
+        loss, gradient = jax.value_and_grad(lambda n: _value_loss(evaluate(n, rollout), target))(network)
+        return rule.step(network, gradient, optimiser), loss
+
+    (network, optimiser), losses = jax.lax.scan(step, (network, optimiser), None, steps)
+    return network, optimiser, losses[0]
 
 
 def _value_loss(found: tuple[Array, Array, Array], target: Float[Array, "T B"]) -> Float[Array, ""]:
