@@ -11,6 +11,7 @@ import pytest
 import rewardtogo as rtg
 from algorithms_under_test import MaskedProbe, first_gradient, jit, lstm, small, small_env
 from rewardtogo.core import MASK
+from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.ops.advantages import normalise
 
 KEY = jax.random.key(0)
@@ -111,7 +112,7 @@ def samples() -> tuple[Any, Any]:
     return state, PLAIN._samples(state, rollout)[0]
 
 
-def test_a_ratio_beyond_the_clip_has_no_gradient(samples):
+def test_a_ratio_beyond_the_clip_has_no_gradient(samples, item):
     state, s = samples
     learner = rtg.PPO(network=small, clip=0.2, value_cost=0.0, normalise_advantages=False)
 
@@ -122,11 +123,12 @@ def test_a_ratio_beyond_the_clip_has_no_gradient(samples):
         found = jax.grad(lambda n: learner._loss(n, changed, jnp.ones(()))[0])(state.network)
         return max(float(jnp.abs(g).max(initial=0)) for g in jax.tree.leaves(found))
 
-    assert gradient(0.5, 1.0) == 0.0  # too likely already, and good
-    assert gradient(0.5, -1.0) > 1e-4  # too likely, and bad
-    assert gradient(-0.5, -1.0) == 0.0  # too unlikely already, and bad
-    assert gradient(-0.5, 1.0) > 1e-4  # too unlikely, and good
-    assert gradient(0.1, 1.0) > 1e-4  # inside
+    with item("7.27") as check:
+        check(gradient(0.5, 1.0), "==", 0, "gradient where an action is too likely already, and good")
+        check(gradient(0.5, -1.0), ">", 1e-4, "too likely, and bad")
+        check(gradient(-0.5, -1.0), "==", 0, "too unlikely already, and bad")
+        check(gradient(-0.5, 1.0), ">", 1e-4, "too unlikely, and good")
+        check(gradient(0.1, 1.0), ">", 1e-4, "inside")
 
 
 def test_the_loss_is_the_sum_that_is_written(samples):
@@ -175,3 +177,42 @@ def test_what_a_policy_keeps(explore):
     assert float(extras["log_prob"]) == pytest.approx(float(jnp.log(thoughts["probabilities"][action])), abs=1e-5)
     if not explore:
         assert int(action) == int(jnp.argmax(thoughts["probabilities"]))
+
+
+@pytest.mark.parametrize("objective", ["adaptive_kl", "dual_kl"])
+def test_a_penalty_keeps_the_divergence_near_its_target(item, objective):
+    """Over the second half of a run, with a constant step size: the median divergence of an update."""
+    learner = rtg.PPO(
+        network=rtg.MLP(32), objective=objective, target_kl=0.01, learning_rate=3e-3, epochs=8, minibatches=2
+    )
+    loop = rtg.OnPolicy(rtg.vectorize(CartPole(), 8), learner, unroll=32)
+
+    def step(state: Any, key: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+        state, (metrics, _) = loop.step(state, key)
+        return state, (metrics["kl"], metrics["multiplier"])
+
+    def run(key: jax.Array) -> Any:
+        return jax.lax.scan(step, loop.init(key), jax.random.split(key, 160))[1]
+
+    kl, multiplier = jax.device_get(jax.jit(run)(KEY))
+    with item("7.20") as check:
+        check(np.median(kl[80:]) / 0.01, ">=", 0.5, f"{objective}: median KL over its target")
+        check(np.median(kl[80:]) / 0.01, "<=", 2.0, f"{objective}: median KL over its target")
+        check(multiplier.min(), ">=", 0, "least multiplier")
+
+
+def test_multipliers_by_hand(item):
+    adaptive, dual = (rtg.PPO(objective=o, target_kl=0.01, dual_rate=0.5) for o in ("adaptive_kl", "dual_kl"))
+    one = jnp.ones(())
+    with item("7.20") as check:
+        found = [float(adaptive._next_multiplier(one, jnp.asarray(kl))) for kl in (0.02, 0.01, 0.005)]
+        check(found == [2.0, 1.0, 0.5], "==", True, "doubled above 1.5 eps, halved below eps / 1.5")
+    with item("7.19") as check:
+        found = [float(dual._next_multiplier(one, jnp.asarray(kl))) for kl in (0.02, 0.01, 0.0)]
+        check(
+            max(abs(a - b) for a, b in zip(found, [1.5, 1.0, 0.5], strict=True)),
+            "<=",
+            1e-6,
+            "lambda + alpha (KL - eps)",
+        )
+        check(float(dual._next_multiplier(0.1 * one, jnp.zeros(()))), "==", 0, "and never below 0 (E7.7)")

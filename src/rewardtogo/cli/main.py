@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from ..catalogue import ALGORITHMS, ENVIRONMENTS, nearest
 
 INTERRUPTED, WRONG = 130, 2
-BACKENDS = ("auto", "jax", "gymnasium")
+BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 MOST_EPISODES = 1_000_000
 
 
@@ -107,7 +107,11 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument("--num-envs", type=_whole, metavar="B", help="environments side by side")
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
     p.add_argument(
-        "--backend", choices=BACKENDS, metavar="BACKEND", default="auto", help="auto, jax (compiled twin) or gymnasium"
+        "--backend",
+        choices=BACKENDS,
+        metavar="BACKEND",
+        default="auto",
+        help="auto, jax (compiled twin), gymnasium or envpool",
     )
     p.add_argument(
         "--preset",
@@ -142,7 +146,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
         choices=BACKENDS,
         metavar="BACKEND",
         default=None,
-        help="auto, jax or gymnasium (default: the run's)",
+        help="auto, jax, gymnasium or envpool (default: the run's)",
     )
     p.add_argument("--checkpoint", default="last", metavar="best|last|N")
     p.add_argument("--stochastic", action="store_true", help="sample actions")

@@ -29,6 +29,7 @@ from jax.experimental import io_callback
 from jaxtyping import Array, Int, Key, PyTree
 
 from ..core import MASK, Action, Observation, State, Timestep, VectorEnv, from_space
+from .envpool import EnvPool
 from .host import TICKETS, Host
 from .host import EnvironmentFailure as EnvironmentFailure
 from .single import single, title
@@ -203,6 +204,11 @@ class GymnasiumEnv(VectorEnv):
     @property
     def num_envs(self) -> int:
         return self.host.size
+
+    @property
+    def backend(self) -> str:
+        """Whose environments these are: `"envpool"` for EnvPool's, `"gymnasium"` for all others."""
+        return "envpool" if isinstance(self.host.envs.unwrapped, EnvPool) else "gymnasium"
 
     @property
     def observation_space(self) -> spaces.Space:

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from ..core import MASK
+from .envpool import EnvPool
 from .translate import Parts, Translation
 
 TICKETS = 2**30
@@ -86,7 +87,7 @@ class Host:
 
     def _reset(self, seeds: list[int]) -> Any:
         # A vector environment that is not made of single ones takes one seed (`gymnasium.vector.VectorEnv.reset`).
-        single = isinstance(self.envs.unwrapped, (vector.SyncVectorEnv, vector.AsyncVectorEnv))
+        single = isinstance(self.envs.unwrapped, (vector.SyncVectorEnv, vector.AsyncVectorEnv, EnvPool))
         batch, info = self.envs.reset(seed=seeds if single else seeds[0])  # type: ignore[arg-type]
         return self._outcome(self._observe(batch, info, np.ones(self.size, bool), "reset"))
 

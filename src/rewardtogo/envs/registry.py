@@ -9,6 +9,7 @@ from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
 from .cartpole import CartPole
+from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
 from .pendulum import Pendulum
@@ -17,8 +18,8 @@ from .time_limit import TimeLimit
 from .vectorize import vectorize
 from .wrappers import MaskObservation
 
-Backend = Literal["auto", "jax", "gymnasium"]
-BACKENDS = ("auto", "jax", "gymnasium")
+Backend = Literal["auto", "jax", "gymnasium", "envpool"]
+BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 
 COMPILED: dict[str, Callable[[], Environment]] = {
     "CartPole-v1": lambda: TimeLimit(CartPole(), 500),
@@ -41,8 +42,9 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
     - `env`: a Gymnasium id (`module:Id` included), one of ours (`rtg list --envs`), a function that makes an environment, a
       `core.Environment`, or a `VectorEnv` (given back as it is).
     - `num_envs`: B, 1 if not given.
-    - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"auto"` for the twin where there is one.
-    - `kwargs`: go to `gymnasium.make`; an environment with arguments is Gymnasium's own.
+    - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"envpool"` for EnvPool's (extra
+      `envpool`), `"auto"` for the twin where there is one, else Gymnasium's.
+    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own.
 
     Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
     """
@@ -54,22 +56,26 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
                 f"this environment already has {env.num_envs} copies: leave num_envs out, or give one that has {num_envs}"
             )
         return env
-    if isinstance(env, Environment):
+    if isinstance(env, Environment) and backend != "envpool":
         return vectorize(env, num_envs or 1)
     if isinstance(env, str):
         return _by_name(env, 1 if num_envs is None else num_envs, backend, kwargs)
     if callable(env) and not isinstance(env, gymnasium.Env):
         made = env(**kwargs)
-        if isinstance(made, (Environment, VectorEnv)):
+        if isinstance(made, VectorEnv) or (isinstance(made, Environment) and backend != "envpool"):
             return make(made, num_envs)
         if isinstance(made, gymnasium.Env):
             made.close()
+    if backend == "envpool":
+        raise ValueError(f"EnvPool makes environments by name, and was given {env!r}: leave the backend out")
     return GymnasiumEnv(cast(Source, env), num_envs, kwargs=kwargs)
 
 
 def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any]) -> VectorEnv:
     if num_envs < 1:
         raise ValueError(f"there must be at least one environment, not {num_envs}")
+    if backend == "envpool":
+        return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
     if name in COMPILED and backend != "gymnasium" and not kwargs:
         return vectorize(COMPILED[name](), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):

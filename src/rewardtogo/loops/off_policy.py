@@ -98,6 +98,12 @@ class OffPolicy(Algorithm, Configured):
     def initial_steps(self) -> int:
         return self._warm_up_blocks * self._block
 
+    @property
+    def uses_per_sample(self) -> float:
+        """How often a step is handed to the learner, on average (item 3.26)."""
+        drawn = self.updates * self.batch_size * (self.length if self._sequential else 1)
+        return drawn / self._block
+
     def with_horizon(self, iterations: int) -> "OffPolicy":
         return dataclasses.replace(self, learner=fix_horizon(self.learner, iterations * self.updates))
 

@@ -64,6 +64,11 @@ class OnPolicy(Algorithm, Configured):
     def initial_steps(self) -> int:
         return 0
 
+    @property
+    def uses_per_sample(self) -> float:
+        """How often a step is handed to the learner (item 3.26)."""
+        return 1.0
+
     def with_horizon(self, iterations: int) -> "OnPolicy":
         return dataclasses.replace(self, learner=fix_horizon(self.learner, iterations))
 

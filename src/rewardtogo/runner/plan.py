@@ -211,10 +211,13 @@ def _check_num_envs(number: Any, env: Any, backend: str, kwargs: dict[str, Any] 
         return
     if isinstance(number, bool) or not isinstance(number, int) or number < 1:
         raise ValueError(f"there must be at least one environment and a whole number of them, not {number}")
-    hosted_by_name = isinstance(env, str) and (env not in COMPILED or backend == "gymnasium" or bool(kwargs))
+    hosted_by_name = isinstance(env, str) and (
+        env not in COMPILED or backend in ("gymnasium", "envpool") or bool(kwargs)
+    )
     if hosted_by_name and number > MOST_HOSTED:
+        whose = "EnvPool" if backend == "envpool" else "Gymnasium"
         raise ValueError(
-            f"{number} Gymnasium environments side by side would each live in this process: ask for at most {MOST_HOSTED}"
+            f"{number} {whose} environments side by side would each live in this process: ask for at most {MOST_HOSTED}"
         )
 
 
@@ -282,7 +285,8 @@ def _title(env: Any) -> str:
 
 
 def _backend(env: VectorEnv | None) -> str:
-    return "gymnasium" if hosted(env) else "jax"
+    doors = hosted(env)
+    return doors[0].backend if doors else "jax"
 
 
 def _evaluation_env(
@@ -299,6 +303,6 @@ def _evaluation_env(
     return make(
         source,
         lanes_for(episodes, compiled),
-        backend="gymnasium" if source in COMPILED and not compiled else backend,  # type: ignore[arg-type]
+        backend=backend if compiled or not isinstance(source, str) else _backend(env),  # type: ignore[arg-type]
         **kwargs,
     )
