@@ -196,8 +196,13 @@ def test_a_penalty_keeps_the_divergence_near_its_target(item, objective):
 
     kl, multiplier = jax.device_get(jax.jit(run)(KEY))
     with item("7.20") as check:
-        check(np.median(kl[80:]) / 0.01, ">=", 0.5, f"{objective}: median KL over its target")
         check(np.median(kl[80:]) / 0.01, "<=", 2.0, f"{objective}: median KL over its target")
+        if objective == "adaptive_kl":
+            check(np.median(kl[80:]) / 0.01, ">=", 0.5, f"{objective}: median KL over its target")
+        else:
+            # A multiplier rests at 0 where the step size alone keeps the policy near enough.
+            active = multiplier[79:-1] > 0
+            check(np.mean(active | (kl[80:] <= 0.01)), ">=", 0.9, "updates with KL <= eps, or a multiplier at work")
         check(multiplier.min(), ">=", 0, "least multiplier")
 
 

@@ -61,11 +61,16 @@ def _channels_first(space: spaces.Space) -> bool:
 
 
 def _turned_space(space: spaces.Space) -> spaces.Space:
-    """The space with its pictures' channels last."""
+    """The space with its pictures' channels last, and without bounds that are none."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({name: _turned_space(part) for name, part in space.spaces.items()})
     if isinstance(space, spaces.Box) and _channels_first(space):
         return spaces.Box(np.moveaxis(space.low, 0, -1), np.moveaxis(space.high, 0, -1), dtype=np.uint8)
+    if isinstance(space, spaces.Box) and isinstance(space.dtype, np.dtype) and space.dtype.kind == "f":
+        # C++'s numeric_limits::min() is the smallest positive number; some environments give it for a missing bound.
+        limits = np.finfo(space.dtype)
+        low = np.where(space.low == limits.tiny, -np.inf, space.low)
+        return spaces.Box(low, np.where(space.high == limits.max, np.inf, space.high), dtype=space.dtype.type)
     return space
 
 
@@ -149,6 +154,7 @@ class EnvPool(vector.VectorEnv):
             first = 0 if seed is None else seed
             seeds = [(first + i) % 2**31 for i in range(self.num_envs)] if isinstance(first, int) else list(first)
             self._pool = self._make(env_type="gymnasium", num_envs=self.num_envs, seed=seeds, **self._made)
+            _spaces_of(self._pool)
         observation, info = self._pool.reset()
         self._ended = np.zeros(self.num_envs, bool)
         self._last = _turned(self._observed, observation), info
@@ -184,12 +190,17 @@ class EnvPool(vector.VectorEnv):
         return self._last
 
 
+def _spaces_of(made: Any) -> tuple[spaces.Space, spaces.Space]:
+    """Of observations and actions, which EnvPool makes when they are first needed, with warnings of float64 bounds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return made.observation_space, made.action_space
+
+
 def _specified(package: Any, name: str, kwargs: dict[str, Any]) -> tuple[dict[str, Any], spaces.Space, spaces.Space]:
     """Configuration, observation and action space, without making an environment."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # bounds that EnvPool states in float64 for spaces of float32
-            spec = package.make_spec(name, **kwargs)
-            return spec.config._asdict(), spec.observation_space, spec.action_space
+        spec = package.make_spec(name, **kwargs)
+        return spec.config._asdict(), *_spaces_of(spec)
     except Exception as cause:  # EnvPool raises whatever a wrong argument leads to
         raise ValueError(f"the environment {name} cannot be made by EnvPool: {_line(cause)}") from cause

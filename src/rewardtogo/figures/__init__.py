@@ -10,6 +10,23 @@ from ..catalogue import nearest
 FIGURES = {
     "1.1": ("markov_chain", "a Markov chain, its simulation, and where its state distribution goes"),
     "1.2": ("anatomy", "the anatomy of reinforcement learning: the three parts of the loop, and the time each takes"),
+    "3.1": (
+        "likelier_trajectories",
+        "three trajectories before and after a step of the policy gradient: the more rewarding, the more probable",
+    ),
+    "4.1": (
+        "actor_critic_networks",
+        "a value network with its weights, and its V beside the exact one of a linear-quadratic problem",
+    ),
+    "4.2": (
+        "parallel_workers",
+        "synchronous and asynchronous workers: who acts with which version of the parameters",
+    ),
+    "estimators": ("estimator_variances", "exact variance and bias of every policy-gradient estimator"),
+    "bias-variance": (
+        "bias_variance",
+        "bias and variance of n-step and lambda-returns, and what n and lambda do to learning",
+    ),
     "7.1": (
         "fisher_ellipse",
         "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..core import Carry, Observation, PRNGKey, Spec
 from .encoding import flat_size, flatten_observation, flatten_part, has_images, input_parts, leaf
@@ -45,8 +45,24 @@ class Linear(eqx.Module):
 
 
 def orthogonal(key: PRNGKey, shape: tuple[int, int]) -> Float[Array, "out in"]:
-    """A uniformly random matrix with orthonormal rows or columns, whichever are fewer."""
-    return jax.nn.initializers.orthogonal()(key, shape, jnp.float32)
+    """A uniformly random matrix with orthonormal rows or columns, whichever are fewer.
+
+    By Gram and Schmidt, each row cleared of the earlier ones twice, which is enough for orthogonality to rounding. Written out because
+    batches of LAPACK's factorisations side by side can wait for each other for ever on a CPU of two cores, and take long to compile.
+    """
+    few, many = min(shape), max(shape)
+    rows = jax.random.normal(key, (few, many))
+
+    def clear(basis: Float[Array, "N M"], i: Int[Array, ""]) -> tuple[Float[Array, "N M"], None]:
+        row = basis[i]
+        earlier = jnp.where(jnp.arange(few)[:, None] < i, basis, 0.0)
+        for _ in range(2):
+            row = row - (earlier @ row) @ earlier
+            row = row / jnp.linalg.norm(row)
+        return basis.at[i].set(row), None
+
+    basis, _ = jax.lax.scan(clear, rows, jnp.arange(few))
+    return basis if shape == (few, many) else basis.T
 
 
 class Torso(eqx.Module):

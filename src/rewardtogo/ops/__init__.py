@@ -44,4 +44,9 @@ from .td import huber as huber
 from .td import n_step_transition as n_step_transition
 from .td import q_target as q_target
 from .td import td_error as td_error
+from .traces import Experience as Experience
+from .traces import backward_view as backward_view
+from .traces import forward_view as forward_view
+from .traces import td_lambda as td_lambda
+from .traces import traced_change as traced_change
 from .vtrace import vtrace as vtrace
