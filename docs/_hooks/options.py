@@ -22,17 +22,17 @@ def _tables(name: str) -> str:
         [
             "| option | default | range | meaning |",
             "|---|---|---|---|",
-            *_rows("learner", learner),
-            *_rows("loop", loop),
+            *_rows("learner", learner, row.learner),
+            *_rows("loop", loop, row.loop_options),
         ]
     )
 
 
-def _rows(group: str, cls: type) -> list[str]:
+def _rows(group: str, cls: type, settings: dict[str, Any]) -> list[str]:
     found = []
     for name, field in options(cls).items():
         about: dict[str, Any] = dict(field.metadata)
         span = " or ".join(map(str, about.get("choices") or ())) or str(about.get("range", ""))
         span = "" if span == "(-inf, inf)" else span
-        found.append(f"| `--{group}.{name.replace('_', '-')}` | {_shown(field.default)} | {span} | {about['doc']} |")
+        found.append(f"| `--{group}.{name.replace('_', '-')}` | {_shown(settings.get(name, field.default))} | {span} | {about['doc']} |")
     return found

@@ -26,10 +26,11 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 EXAMPLES = ROOT / "examples"
 PAGES = sorted(p for p in [*ROOT.glob("*.md"), *DOCS.rglob("*.md")] if p.name != "coverage.md")
+CHAPTERS = sorted((DOCS / "chapters").glob("*.md"))
 CHAPTER = DOCS / "chapters" / "01-introduction.md"
 RUN = [
     ROOT / "README.md",
-    CHAPTER,
+    *CHAPTERS,
     *(DOCS / f"{name}.md" for name in ("tour", "environments", "networks", "learners", "callbacks", "notation")),
 ]
 """Pages whose Python runs from top to bottom."""
@@ -194,9 +195,11 @@ def test_every_public_name_is_on_the_api_page():
 
 def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
     """The smallest algorithm of a row of the catalogue."""
-    env, learner = rtg.make(env_name, 2), resolve(row.path)()
+    env, learner = rtg.make(env_name, 2), build(resolve(row.path), row.learner)
     if row.loop == "on_policy":
         return rtg.OnPolicy(env, learner, unroll=8)
+    if row.loop == "asynchronous":
+        return rtg.Asynchronous(env, learner, workers=2, unroll=4)
     if row.loop == "off_policy":
         return rtg.OffPolicy(env, learner, rtg.UniformReplay(64), unroll=2, warm_up=8, batch_size=4)
     spec, steps = env_spec(env), jnp.arange(4)

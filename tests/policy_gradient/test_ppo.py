@@ -13,6 +13,7 @@ from algorithms_under_test import MaskedProbe, first_gradient, jit, lstm, small,
 from rewardtogo.core import MASK
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.ops.advantages import normalise
+from rewardtogo.policy_gradient.fit import Samples, samples_of
 
 KEY = jax.random.key(0)
 LENGTH = 40
@@ -80,9 +81,7 @@ def test_one_step_without_clipping_is_the_policy_gradient():
     assert relative_gap(first_gradient(new.optimiser, state.network), expected) <= 1e-6
     assert (
         relative_gap(
-            jit(jax.grad(lambda n: PLAIN._loss(n, PLAIN._samples(state, rollout)[0], state.multiplier)[0]))(
-                state.network
-            ),
+            jit(jax.grad(lambda n: PLAIN._loss(n, arranged(state, rollout), state.multiplier)[0]))(state.network),
             expected,
         )
         <= 1e-6
@@ -106,10 +105,14 @@ def test_the_ratio_begins_at_one(network):
     assert float(new.norm.count) == 3 * LENGTH * 4
 
 
+def arranged(state: Any, rollout: Any) -> Samples:
+    return samples_of(state.network, state.norm, rollout, PLAIN.gamma, PLAIN.gae_lambda, normalised=False, bptt=32)
+
+
 @pytest.fixture(scope="module")
 def samples() -> tuple[Any, Any]:
     state, rollout = played(PLAIN)
-    return state, PLAIN._samples(state, rollout)[0]
+    return state, arranged(state, rollout)
 
 
 def test_a_ratio_beyond_the_clip_has_no_gradient(samples, item):

@@ -37,7 +37,8 @@ class OffPolicyState(eqx.Module):
 class OffPolicy(Algorithm, Configured):
     """Each iteration takes `unroll` steps in each environment and then learns from `updates` batches drawn from the replay.
 
-    The first `warm_up` steps, inside `init`, are those of a uniformly random policy. Raises `ValueError` where the learner wants
+    The first `warm_up` steps, inside `init`, are those of a uniformly random policy, or of the learner's own where it keeps the
+    probabilities of its actions. Raises `ValueError` where the learner wants
     fresh rollouts, or where the replay cannot hold what is asked of it.
     """
 
@@ -47,7 +48,7 @@ class OffPolicy(Algorithm, Configured):
     unroll: int = setting(4, "steps in each environment between two visits to the replay", at_least=1)
     updates: int = setting(1, "batches learnt from in each iteration", at_least=1)
     batch_size: int = setting(64, "transitions (or sequences) in a batch", at_least=1)
-    warm_up: int = setting(1000, "environment steps of a random policy before the first update", at_least=1)
+    warm_up: int = setting(1000, "environment steps before the first update, at random", at_least=1)
     length: int = setting(16, "steps of a sequence, for learners that want sequences", at_least=1)
 
     def __check_init__(self) -> None:
@@ -112,16 +113,18 @@ class OffPolicy(Algorithm, Configured):
         learner = self.learner.init(self.spec, learner_key)
         policy = self.learner.policy(learner, explore=True)
         actor = begin(self.env, policy, actor_key)
-        random = _Carrying(RandomPolicy(self.spec), policy)
         keys = jax.random.split(warm_key, self._warm_up_blocks)
         _, example, _ = jax.eval_shape(
             lambda a, k: collect(self.env, policy, a, k, self.unroll, self._sequential), actor, keys[0]
         )
         replay = self.replay.init(example.transitions, self.unroll)
+        # Where probabilities are kept, they must be those of the actions taken: then the learner's own policy warms up.
+        stochastic = "log_prob" in example.transitions.extras
+        warm = policy if stochastic else _Carrying(RandomPolicy(self.spec), policy)
 
         def block(loop: tuple[Actor, ReplayState], key: PRNGKey) -> tuple[tuple[Actor, ReplayState], None]:
             actor, replay = loop
-            actor, rollout, _ = collect(self.env, random, actor, key, self.unroll, self._sequential)
+            actor, rollout, _ = collect(self.env, warm, actor, key, self.unroll, self._sequential)
             return (actor, self.replay.add(replay, rollout.transitions)), None
 
         (actor, replay), _ = jax.lax.scan(block, (actor, replay), keys)

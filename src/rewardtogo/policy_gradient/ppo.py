@@ -23,15 +23,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..core import (
-    Action,
-    Carry,
     EnvSpec,
     Learner,
     Number,
-    Observation,
     PRNGKey,
     Rollout,
     number,
@@ -49,13 +46,12 @@ from ..nn import (
     RunningNorm,
     as_network,
     global_norm,
-    piece_length,
-    pieces,
     require_fresh,
 )
-from ..ops.advantages import gae, normalise
+from ..ops.advantages import normalise
 from ..ops.metrics import explained_variance
 from ..ops.shuffle import permutations
+from .fit import Samples, minibatch_size, samples_of
 
 
 class PPOState(eqx.Module):
@@ -66,18 +62,6 @@ class PPOState(eqx.Module):
     norm: RunningNorm | None
     multiplier: Float[Array, ""]
     updates: Int[Array, ""]
-
-
-class Samples(eqx.Module):
-    """What the loss looks at: single steps `[N]`, or with a memory sequences `[N, L]` and the memory `[N]` before each."""
-
-    observation: Observation
-    action: Action
-    log_prob: Float[Array, "..."]
-    advantage: Float[Array, "..."]
-    target: Float[Array, "..."]
-    done: Bool[Array, "..."]
-    carry: Carry
 
 
 class PPO(Learner):
@@ -128,9 +112,11 @@ class PPO(Learner):
     def update(self, state: PPOState, batch: Rollout, key: PRNGKey) -> tuple[PPOState, dict[str, Array], tuple[()]]:
         require_fresh(batch.transitions, state.updates, "PPO")
         now = self.at(state.updates)
-        samples, value = now._samples(state, batch)
+        samples = samples_of(
+            state.network, state.norm, batch, now.gamma, now.gae_lambda, normalised=False, bptt=self.bptt
+        )
         size = len(samples.log_prob)
-        per_minibatch = self._minibatch_size(size, state.network.recurrent)
+        per_minibatch = minibatch_size(size, self.minibatches, state.network.recurrent)
 
         def minibatch(
             loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]
@@ -146,7 +132,9 @@ class PPO(Learner):
         (network, optimiser), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
         # Statistics change after the update, so that the ratio starts at exactly 1.
         norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
-        metrics = jax.tree.map(jnp.mean, metrics) | {"explained_variance": explained_variance(value, samples.target)}
+        metrics = jax.tree.map(jnp.mean, metrics) | {
+            "explained_variance": explained_variance(samples.value, samples.target)
+        }
         multiplier = state.multiplier
         if self.objective != "clip":
             kl = now._loss(network, samples, multiplier)[1]["approx_kl"]
@@ -160,24 +148,6 @@ class PPO(Learner):
             return jnp.maximum(0.0, multiplier + self.dual_rate * (kl / self.target_kl - 1.0))
         factor = jnp.where(kl > 1.5 * self.target_kl, 2.0, jnp.where(kl < self.target_kl / 1.5, 0.5, 1.0))
         return jnp.clip(multiplier * factor, 1e-6, 1e6)
-
-    def _samples(self, state: PPOState, rollout: Rollout) -> tuple[Samples, Float[Array, "..."]]:
-        """Advantages and targets of a rollout, arranged as the loss takes them; and the old values, likewise."""
-        t = rollout.transitions
-        norm = (lambda x: x) if state.norm is None else state.norm
-        value, next_value = state.network.values(rollout, norm)
-        discount = self.gamma * (1.0 - t.terminated)
-        advantage = jax.vmap(gae, in_axes=(1, 1, 1, 1, None, 1), out_axes=1)(
-            t.reward, discount, value, next_value, self.gae_lambda, t.done
-        )
-        observation = jax.vmap(jax.vmap(norm))(t.observation)
-        steps = Samples(observation, t.action, t.extras["log_prob"], advantage, advantage + value, t.done, ())
-        if not state.network.recurrent:
-            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (steps, value))
-        length = piece_length(len(t.reward), self.bptt)
-        carry = jax.tree.map(lambda x: pieces(x, length)[:, 0], state.network.carries(rollout, norm))
-        steps, value = jax.tree.map(lambda x: pieces(x, length), (steps, value))
-        return eqx.tree_at(lambda s: s.carry, steps, carry), value
 
     def _loss(self, network: ActorCritic, s: Samples, multiplier: Float[Array, ""]) -> tuple[Array, dict[str, Array]]:
         log_prob, entropy, value = jax.vmap(lambda *step: network.evaluate(*step))(
@@ -205,12 +175,3 @@ class PPO(Learner):
 
     def _optimiser(self) -> Optimiser:
         return Optimiser(self.learning_rate, self.max_grad_norm, eps=1e-5)
-
-    def _minibatch_size(self, size: int, recurrent: bool) -> int:
-        if size < self.minibatches:
-            what = "sequences (a memory needs whole ones)" if recurrent else "steps"
-            raise ValueError(
-                f"a rollout of {size} {what} cannot make {self.minibatches} minibatches: "
-                f"ask for at most {size} with minibatches={size}, or for more {what.split()[0]}"
-            )
-        return size // self.minibatches

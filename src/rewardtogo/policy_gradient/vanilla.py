@@ -9,7 +9,7 @@ leave-one-out, the time-dependent mean, the learned value, or the optimal ones; 
 returns (`mc`), to r + gamma V(s') (`td`) or to lambda-returns (`td_lambda`) by regression, before the actor's step (Algorithms 3 to 5) or
 after it (the common order, erratum E4.7). With a `shared` torso (4.7) one step is taken on the sum of both losses.
 
-`reinforce`, `vpg`, `batch_ac`, `batch_ac_discount`, `online_ac` and `a2c` are settings of this learner (`rtg list`).
+`reinforce`, `vpg`, `batch_ac`, `online_ac`, `a2c` and `async_ac` are settings of this learner (`rtg list`).
 
 Deviations from the notes: the sum over samples is a mean (decision D2). A return that is cut, by a time limit or by the end of the
 rollout, goes on with V of the observation after it (erratum E1.5), unless `bootstrap` is off; inside an episode that ends there is no

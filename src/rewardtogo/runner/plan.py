@@ -107,6 +107,11 @@ def plan(
                 else ready.get("num_envs", (row and row.num_envs) or cls.default_num_envs())
             )
             vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            if kind == "asynchronous" and hosted(vector_env):
+                raise ValueError(
+                    f"{name} acts with several policies in one compiled program, which an environment outside of it ({env_name}) "
+                    "cannot follow: use one of `rtg list --envs`, or a2c"
+                )
             whole = build(cls, options, env=vector_env, learner=inner)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
     iterations = _iterations(whole, steps)
