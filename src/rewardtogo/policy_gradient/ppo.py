@@ -122,7 +122,8 @@ class PPO(Learner):
             loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]
         ) -> tuple[tuple[ActorCritic, optax.OptState], dict[str, Array]]:
             network, optimiser = loop
-            chosen = jax.tree.map(lambda x: x[rows], samples)
+            # One minibatch is the whole rollout, in whatever order.
+            chosen = samples if self.minibatches == 1 else jax.tree.map(lambda x: x[rows], samples)
             gradient, metrics = jax.grad(now._loss, has_aux=True)(network, chosen, state.multiplier)
             return now._optimiser().step(network, gradient, optimiser), metrics | {"grad_norm": global_norm(gradient)}
 

@@ -181,7 +181,7 @@ def _environment(described: dict[str, Any], env: Any, backend: str, episodes: in
         backend, kwargs = described["backend"] if backend == "auto" else backend, described["kwargs"]
     if isinstance(env, VectorEnv):
         return name, env
-    compiled = backend != "gymnasium" and (not isinstance(env, str) or env in COMPILED)
+    compiled = backend not in ("gymnasium", "envpool") and (not isinstance(env, str) or env in COMPILED)
     return name, make(env, lanes_for(episodes, compiled), backend=backend, **kwargs)  # type: ignore[arg-type]
 
 

@@ -8,6 +8,7 @@ for NaN. Where a chunk ends does not show in any result: rows of metrics end at 
 import dataclasses
 import math
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -29,9 +30,8 @@ LARGE = 2**20
 the state with a chunk that fails, and not donating small arrays costs nothing to speak of."""
 
 
-SEEDS_AT_ONCE = 16
-"""Seeds that are computed side by side. Beyond it their activations leave the processor's cache: 64 at once cost PPO half as much
-again a seed as 16 at once."""
+STEPS_AT_ONCE = 16_384
+"""Environment steps that the seeds of a program make side by side in an iteration: what more of them touch no longer fits the caches."""
 
 
 class NonFinite(RuntimeError):
@@ -83,13 +83,16 @@ def iterations_for(algorithm: Algorithm, steps: int) -> int:
     return max(1, math.ceil((steps - algorithm.initial_steps) / algorithm.steps_per_iteration))
 
 
-def by_groups(function: Callable, seeds: Any) -> Any:
-    """`function` of each seed: all side by side, or where they are many in groups of equal size, one group after another."""
+def by_groups(function: Callable, seeds: Any, most: int) -> Any:
+    """`function` of each seed: all side by side, or where they are more than `most` in groups of equal size, one after another."""
     count = len(jax.tree.leaves(seeds)[0])
-    group = max(size for size in range(1, min(count, SEEDS_AT_ONCE) + 1) if count % size == 0)
-    if count <= SEEDS_AT_ONCE or group < SEEDS_AT_ONCE // 2:
+    group = max(size for size in range(1, min(count, most) + 1) if count % size == 0)
+    if count <= most or group < most // 2:
         return jax.vmap(function)(seeds)
-    return jax.lax.map(function, seeds, batch_size=group)
+    # Not `lax.map(batch_size=...)`, which cannot take arrays without elements.
+    apart = jax.tree.map(lambda x: x.reshape(count // group, group, *x.shape[1:]), seeds)
+    done = jax.lax.map(jax.vmap(function), apart)
+    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), done)
 
 
 class Program:
@@ -152,8 +155,26 @@ class Program:
         """A fresh state: one compiled program, because op by op costs seconds."""
         # It runs once, so that optimising it would cost more than it saves.
         quickly = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
-        program = self._compile(self._init_all, self.algorithm, self.key, compiler_options=quickly)
-        return self.guarded(lambda: program(self.algorithm, self.key))
+        ahead = threading.Thread(target=self._compile_ahead)
+        ahead.start()
+        try:
+            program = self._compile(self._init_all, self.algorithm, self.key, compiler_options=quickly)
+            state = self.guarded(lambda: program(self.algorithm, self.key))
+        finally:
+            began = time.perf_counter()
+            ahead.join()
+            self.compile_seconds += time.perf_counter() - began
+        return state
+
+    def _compile_ahead(self) -> None:
+        """Compile `advance` from shapes alone, beside `init`. What fails here is met again, and told, where it is called."""
+        if not jax.sharding.get_mesh().empty or hosted(self.algorithm):
+            return
+        try:
+            state = self.shapes()
+            self._advance = self._compile_advance(state, self.fresh_sums(state))
+        except Exception:
+            self._advance = None
 
     def fresh_sums(self, state: State) -> Array:
         """Sums of a row of metrics in which nothing has happened: `[M]`, or `[K, M]`."""
@@ -169,32 +190,25 @@ class Program:
 
     def advance(self, state: State, sums: Array, start: int, stop: int) -> tuple[State, Array, np.ndarray]:
         """Iterations `start` to `stop` (at most `ROWS_PER_CHUNK` rows): new state, sums of the unfinished row, table of finished rows."""
-        leaves, structure = jax.tree.flatten(state)
-        large = [leaf.nbytes >= LARGE for leaf in leaves]
-        big = [x for x, heavy in zip(leaves, large, strict=True) if heavy]
-        small = [x for x, heavy in zip(leaves, large, strict=True) if not heavy]
+        big, small = _split(jax.tree.leaves(state))
         if self._advance is None:
-            self._learn_names(state)
-            function = partial(self._chunk, structure, tuple(large))
-            self._advance = self._compile(
-                function,
-                self.algorithm,
-                big,
-                small,
-                sums,
-                self.key,
-                0,
-                0,
-                1,
-                donate_argnums=1,
-                out_shardings=_places((leaves, sums)),
-            )
+            began = time.perf_counter()
+            self._advance = self.guarded(lambda: self._compile_advance(state, sums))
+            self.compile_seconds += time.perf_counter() - began
         new, sums, table = self.guarded(
             lambda: self._advance(self.algorithm, big, small, sums, self.key, start, stop, self.row_every)
         )
         # Rows first, whatever the number of seeds: [R, M], or [R, M, K].
         table = np.moveaxis(np.asarray(table), 0, -1) if self.batched else np.asarray(table)
-        return jax.tree.unflatten(structure, new), sums, table
+        return jax.tree.unflatten(jax.tree.structure(state), new), sums, table
+
+    def _compile_advance(self, state: State, sums: Array) -> Any:
+        """The program of a chunk, for a state of these shapes."""
+        self._learn_names(state)
+        leaves, structure = jax.tree.flatten(state)
+        function = partial(self._chunk, structure, tuple(_is_large(leaf) for leaf in leaves))
+        chunk = jax.jit(function, donate_argnums=1, out_shardings=_places((leaves, sums)))
+        return chunk.lower(self.algorithm, *_split(leaves), sums, self.key, 0, 0, 1).compile()
 
     def _chunk(
         self,
@@ -212,7 +226,8 @@ class Program:
         heavy, light = iter(big), iter(small)
         state = jax.tree.unflatten(structure, [next(heavy) if is_large else next(light) for is_large in large])
         one = lambda seed: self._run_one(algorithm, seed[0], seed[1], seed[2], start, stop, every)  # noqa: E731
-        state, sums, table = by_groups(one, (state, sums, key)) if self.batched else one((state, sums, key))
+        most = max(1, STEPS_AT_ONCE // algorithm.steps_per_iteration)
+        state, sums, table = by_groups(one, (state, sums, key), most) if self.batched else one((state, sums, key))
         return jax.tree.leaves(state), sums, table
 
     def _run_one(
@@ -291,6 +306,15 @@ class Program:
                     "batch, the unroll, the replay, or the number of environments or seeds smaller"
                 ) from error
             raise
+
+
+def _is_large(leaf: Any) -> bool:
+    return math.prod(leaf.shape) * leaf.dtype.itemsize >= LARGE
+
+
+def _split(leaves: list[Any]) -> tuple[list[Any], list[Any]]:
+    """What is large, and is donated; and the rest."""
+    return [x for x in leaves if _is_large(x)], [x for x in leaves if not _is_large(x)]
 
 
 def _places(arguments: tuple[list[Array], Array]) -> Any:

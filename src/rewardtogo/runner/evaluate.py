@@ -45,10 +45,10 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: Array | int, rows: 
 
     def body(loop: tuple[Actor, Returns, Array]) -> tuple[Actor, Returns, Array]:
         actor, found, step = loop
-        act_key, env_key = jax.random.split(jax.random.fold_in(loop_key, step))
+        act_keys, env_keys = jax.random.split(jax.random.fold_in(loop_key, step), (2, lanes))
         choose = jax.vmap(lambda c, o, k: policy(c, o, k))
-        carry, action, _ = choose(actor.carry, actor.observation, jax.random.split(act_key, lanes))
-        env_state, timestep = env.step(actor.env_state, action_spec.clip(action), jax.random.split(env_key, lanes))
+        carry, action, _ = choose(actor.carry, actor.observation, act_keys)
+        env_state, timestep = env.step(actor.env_state, action_spec.clip(action), env_keys)
         done = timestep.done
         total, length = actor.stats.return_so_far + timestep.score, actor.stats.length_so_far + 1.0
         here = (jnp.arange(rows, dtype=jnp.float32)[:, None] == found.finished[None, :]) & done[None, :]
@@ -80,17 +80,24 @@ class Evaluator:
     def _quota(self, episodes: int) -> int:
         return -(-episodes // self.env.num_envs)
 
+    def prepare(self, policy: Policy) -> None:
+        """Compile what plays policies of this kind, by playing no episode at all."""
+        self._play(policy, jax.random.key(0), 0, self._rows)
+
+    def _play(self, policy: Policy, key: Array, quota: int, rows: int) -> Any:
+        play: Callable[..., Any] = partial(_play, rows=rows)
+        if self.seeds:
+            play = jax.vmap(play, in_axes=(None, 0, None, None))
+        return jax.device_get(play(self.env, policy, key, quota))
+
     def __call__(self, policy: Policy, key: Array, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns and lengths `[N]` (`[K, N]` with seeds), N the episodes asked for, rounded up to whole rounds.
 
         Raises `ValueError` where an episode does not end, `EnvironmentFailure` where a foreign environment fails.
         """
         quota = self._quota(self.episodes if episodes is None else episodes)
-        play: Callable[..., Any] = partial(_play, rows=max(self._rows, quota))
-        if self.seeds:
-            play = jax.vmap(play, in_axes=(None, 0, None, None))
         try:
-            found = jax.device_get(play(self.env, policy, key, quota))
+            found = self._play(policy, key, quota, max(self._rows, quota))
         except Exception as error:
             failure = failure_of(self.env)
             raise (failure or error) from (error if failure else None)

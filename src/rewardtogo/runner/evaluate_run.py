@@ -109,7 +109,9 @@ def environment_of(folder: RunFolder, env: Any, backend: str | None, episodes: i
         return name
     if isinstance(name, (gymnasium.Env, gymnasium.vector.VectorEnv)):
         return GymnasiumEnv(name)
-    compiled = name in COMPILED and backend != "gymnasium" and not kwargs if isinstance(name, str) else True
+    compiled = (
+        name in COMPILED and backend not in ("gymnasium", "envpool") and not kwargs if isinstance(name, str) else True
+    )
     lanes = lanes_for(episodes, compiled)
     return make(name, lanes, backend=backend, **kwargs)  # type: ignore[arg-type]
 

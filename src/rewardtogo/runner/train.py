@@ -10,6 +10,7 @@ import threading
 import time
 import types
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from .engine import Callback, Every, Moment, Program, run, steps_after
 from .evaluate import Evaluator, lanes_for, summary
 from .folder import RunFolder, new_folders
 from .plan import Plan, check_budget, from_config, plan
-from .plot import draw_curves
 from .policy import LoadedPolicy, load, save_policy
 from .progress import Reporter
 from .sinks import CSV, SINKS, Sink, require_sinks
@@ -240,6 +240,8 @@ class Session:
                 self.checkpoint(moment)
             return asked.raised or late
 
+        ahead = threading.Thread(target=self._prepare)
+        ahead.start()
         try:
             with asked:
                 every = Every(self.plan.config["eval_every"], self.evaluate)
@@ -263,11 +265,24 @@ class Session:
                 return self._finish(moment, reporter)
         finally:
             reporter.close()
+            ahead.join()
             for sinks in self.sinks:
                 for sink in sinks:
                     sink.close()
             for env in hosted((self.plan.env, self.plan.eval_env)):
                 env.close()
+
+    def _prepare(self) -> None:
+        """What is needed later, beside the compilation of the training: programs that evaluate, and the library that draws.
+
+        What fails here is met again, and told, where it is needed.
+        """
+        if self.evaluator is not None and not hosted((self.plan.env, self.plan.eval_env)):
+            with contextlib.suppress(Exception):
+                for explore in (False, True):
+                    policy = jax.eval_shape(partial(self._policy, explore=explore), self.program.shapes())
+                    self.evaluator.prepare(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy))
+        from . import plot as plot
 
     def _resumed(self, resume_from: Any) -> Moment:
         """The end of a run that was stopped after its last iteration and before its last evaluation."""
@@ -286,6 +301,8 @@ class Session:
 
     def _finish(self, moment: Moment, reporter: Reporter) -> list[Run]:
         """The last evaluation, the curve, and `evaluation.json`."""
+        from .plot import draw_curves  # takes half a second, which `_prepare` has spent meanwhile
+
         runs = []
         results: list[dict[str, Any] | None] = [None] * len(self.seeds)
         if self.evaluator is not None:
