@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array
 
 import rewardtogo as rtg
-from rewardtogo.nn import ACTION_KINDS, ActorCritic, ActorCriticPolicy, Adam, as_network
+from rewardtogo.nn import ACTION_KINDS, ActorCritic, ActorCriticPolicy, Optimiser, as_network
 from rewardtogo.ops import gae, normalise
 
 
@@ -41,7 +41,7 @@ class A2C(rtg.Learner):
 
     def init(self, spec, key):
         network = ActorCritic.of(self.network, spec, key)
-        return A2CState(network, Adam(0.0, 0.5).init(network), jnp.zeros((), jnp.int32))
+        return A2CState(network, Optimiser(0.0, 0.5).init(network), jnp.zeros((), jnp.int32))
 
     def policy(self, state, explore):
         return ActorCriticPolicy(state.network, None, explore)
@@ -61,5 +61,5 @@ class A2C(rtg.Learner):
             return policy_loss + 0.5 * value_loss, {"policy_loss": policy_loss, "value_loss": value_loss}
 
         gradient, metrics = jax.grad(loss, has_aux=True)(state.network)
-        network, optimiser = Adam(now.learning_rate, 0.5).step(state.network, gradient, state.optimiser)
+        network, optimiser = Optimiser(now.learning_rate, 0.5).step(state.network, gradient, state.optimiser)
         return A2CState(network, optimiser, state.updates + 1), metrics, ()

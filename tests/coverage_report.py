@@ -2,6 +2,7 @@
 
     python tests/coverage_report.py          # the default tests; results of slow ones are those stored
     python tests/coverage_report.py --slow   # the slow tests; stores their results with commit, command and date
+    python tests/coverage_report.py --slow -k trpo   # some of them; the others' stored results stay
 
 The checks come from the tests themselves (the fixture `item`), in the run that this script makes; nothing is written by hand.
 """
@@ -23,12 +24,14 @@ SHOWN = 6
 """Checks of one item that the table shows; the rest are counted."""
 
 
-def run(slow: bool) -> tuple[list[dict], int]:
+def run(slow: bool, more: list[str]) -> tuple[list[dict], int]:
     """Run the tests; every recorded check, and pytest's exit status."""
     with tempfile.TemporaryDirectory() as folder:
         marker = "slow" if slow else "not slow"
-        command = [sys.executable, "-m", "pytest", "-q", "-m", marker, *(() if slow else ("-n", "2"))]
-        status = subprocess.run(command, cwd=ROOT, env={**os.environ, "RTG_COVERAGE": folder}).returncode
+        command = [sys.executable, "-m", "pytest", "-q", "-m", marker, *(() if slow else ("-n", "2")), *more]
+        # Slow tests compute much: there the compiler may optimise, which default tests forbid it.
+        flags = {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "")} if slow else {}
+        status = subprocess.run(command, cwd=ROOT, env={**os.environ, **flags, "RTG_COVERAGE": folder}).returncode
         rows = [
             json.loads(line) for file in sorted(Path(folder).glob("*.jsonl")) for line in file.read_text().splitlines()
         ]
@@ -95,7 +98,7 @@ def write(rows: list[dict]) -> None:
 def main() -> int:
     """Run, store, write; pytest's exit status."""
     slow = "--slow" in sys.argv[1:]
-    rows, status = run(slow)
+    rows, status = run(slow, [word for word in sys.argv[1:] if word != "--slow"])
     if slow:
         store(rows)
         return status

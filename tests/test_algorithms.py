@@ -16,8 +16,9 @@ from jax.sharding import AxisType
 
 import rewardtogo as rtg
 from algorithms_under_test import ALGORITHMS_UNDER_TEST, jit, on_policy, small_env
-from rewardtogo.catalogue import ALGORITHMS
+from rewardtogo.catalogue import ALGORITHMS, LOOPS
 from rewardtogo.core import Algorithm, Episodes
+from rewardtogo.runner.config import build, options, resolve
 
 HORIZON = 10
 KEYS = [jax.random.key(seed) for seed in (0, 1)]
@@ -162,7 +163,7 @@ def test_two_devices_give_the_numbers_of_one(name):
     with jax.set_mesh(mesh):
         after = jit(lambda a, s, k: a.step(s, k)[0])(a, start(name, 0), jax.random.fold_in(KEYS[0], 0))
     assert distance(a.learned(alone), a.learned(jax.device_get(after))) <= 1e-5
-    if not isinstance(a, rtg.Offline):
+    if isinstance(a, (rtg.OnPolicy, rtg.OffPolicy)):
         assert not any(leaf.sharding.is_fully_replicated for leaf in jax.tree.leaves(after.actor) if leaf.size)
 
 
@@ -181,15 +182,18 @@ def test_a_sweep_is_a_vmap():
 
 
 def test_the_catalogue_says_what_learners_do():
-    loops = {"rollout": "on_policy", "transitions": "off_policy", "sequences": "off_policy"}
+    loops = {
+        "rollout": ("on_policy", "asynchronous"),
+        "transitions": ("off_policy", "offline"),
+        "sequences": ("off_policy", "offline"),
+    }
+    tested = {type(algorithm(name).learner) for name in ALGORITHMS_UNDER_TEST}  # type: ignore[attr-defined]
     for name, row in ALGORITHMS.items():
-        if row.loop == "offline" and name not in ALGORITHMS_UNDER_TEST:
-            continue
-        assert name in ALGORITHMS_UNDER_TEST, f"{name} has no row in tests/algorithms_under_test.py"
-        learner = algorithm(name).learner  # type: ignore[attr-defined]
-        assert f"{type(learner).__module__}:{type(learner).__name__}" == row.path
+        learner = build(resolve(row.path), row.learner)
+        assert type(learner) in tested, f"{name} has no row in tests/algorithms_under_test.py"
         assert learner.action_kinds == row.actions
-        assert row.loop in (loops[learner.batch], "offline")
+        assert row.loop in loops[learner.batch]
+        assert set(row.loop_options) <= set(options(resolve(LOOPS[row.loop])))
 
 
 # --- scaling ---------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ _PPO = {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_g
 PRESETS: dict[tuple[str, str], Preset] = {
     # Every one was found here; scores over seeds are in docs/results.md.
     ("ppo", "CartPole-v1"): {"steps": 100_000, "num_envs": 8, "loop": {"unroll": 128}, "learner": _PPO},
+    # The decoder after the memory matters: without it no seed in three reached 500 while sampling its actions.
     ("ppo", "CartPoleNoVel-v1"): {
         "steps": 300_000,
         "num_envs": 8,
@@ -19,8 +20,9 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "learner": {
             "learning_rate": "linear:1e-3:0",
             "epochs": 10,
-            "minibatches": 4,
+            "minibatches": 8,
             "max_grad_norm": 1.0,
+            "normalise_observations": True,
             "network": {"class": "gru", "size": 64},
         },
     },

@@ -106,15 +106,16 @@ def weights_of(estimator: Estimator, values: Float[Array | np.ndarray, "... S"] 
         states = np.zeros((number, steps + 1), int) if values is None else np.asarray(trajectories.observations)
         table = np.broadcast_to(table, (steps + 1, table.shape[-1]))
         value = table[np.arange(steps + 1), states]
-        arrays = (
-            reward,
-            float(estimator.gamma) * (1.0 - terminated),
-            cut,
-            value[:, :-1],
-            value[:, 1:],
-            np.ones_like(reward),
+        rows = lambda x: jnp.asarray(x.T)  # noqa: E731
+        seen = Steps(
+            rows(reward),
+            rows(float(estimator.gamma) * (1.0 - terminated)),
+            rows(cut),
+            rows(value[:, :-1]),
+            rows(value[:, 1:]),
+            rows(np.ones_like(reward)),
+            jnp.zeros(number, jnp.int32),
         )
-        seen = Steps(*(jnp.asarray(x.T) for x in arrays), jnp.zeros(number, jnp.int32))
         return np.where(taken, np.asarray(estimator.weights(seen)).T, 0.0)
 
     return weights
