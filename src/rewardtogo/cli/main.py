@@ -320,10 +320,10 @@ def _list(options: argparse.Namespace) -> int:
             )
         )
         return 0
-    print(f"{'name':<11}{'chapter':<9}{'number':<8}{'actions':<30}summary")
+    print(f"{'name':<14}{'chapter':<9}{'number':<10}{'actions':<30}summary")
     for row in ALGORITHMS.values():
         print(
-            f"{row.name:<11}{row.chapter:<9}{row.number:<8}{'any' if len(row.actions) == 4 else ', '.join(row.actions):<30}{row.summary}"
+            f"{row.name:<14}{row.chapter:<9}{row.number:<10}{'any' if len(row.actions) == 4 else ', '.join(row.actions):<30}{row.summary}"
         )
     return 0
 
