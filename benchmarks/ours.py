@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -18,9 +19,35 @@ from rewardtogo.cli.commands import use_cache
 from rewardtogo.runner.engine import Program
 
 ENV = "CartPole-v1"
-PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"sizes": [64, 64]}}
-DQN: dict[str, Any] = {"learning_rate": 1e-3, "target_period": 250}
+TWO = {"network": {"sizes": [64, 64]}}
+PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, **TWO}
 OFF: dict[str, Any] = {"batch_size": 64, "unroll": 4, "updates": 1, "warm_up": 1000, "replay": {"capacity": 100_000}}
+
+
+@dataclass
+class Task:
+    """What is trained: the peers' scripts have the same settings."""
+
+    algorithm: str
+    learner: dict[str, Any]
+    loop: dict[str, Any]
+    num_envs: int = 8
+    env: str = ENV
+
+
+TRAINED = {
+    "ppo": Task("ppo", PPO, {"unroll": 128}),
+    "dqn": Task("dqn", {"learning_rate": 1e-3, "target_period": 250}, OFF, num_envs=1),
+    "a2c": Task("a2c", TWO, {"unroll": 5}),
+    # 160 steps of the value function a rollout, as sb3-contrib takes: ten passes of 128 samples each.
+    "trpo": Task("trpo", {"value_epochs": 10, "minibatches": 16, "cg_iterations": 15, **TWO}, {"unroll": 256}),
+    "recurrent": Task(
+        "ppo",
+        {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"class": "lstm", "size": 64}},
+        {"unroll": 128},
+        env="CartPoleNoVel-v1",
+    ),
+}
 
 
 def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
@@ -38,19 +65,19 @@ def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
 def train(given: argparse.Namespace) -> dict[str, Any]:
     """A whole run with its folder, metrics and evaluations: steps a second as the library itself reports them."""
     seen: list[tuple[int, float, float]] = []
-    on_policy = given.name == "ppo"
+    task = TRAINED[given.name]
     with tempfile.TemporaryDirectory() as folder:
         run = rtg.train(
-            given.name,
-            ENV,
-            steps=given.steps + (0 if on_policy else OFF["warm_up"]),
+            task.algorithm,
+            task.env,
+            steps=given.steps + task.loop.get("warm_up", 0),
             seed=given.seed,
-            num_envs=8 if on_policy else 1,
+            num_envs=task.num_envs,
             out=f"{folder}/run",
             backend=given.backend,
             preset="none",
-            learner=PPO if on_policy else DQN,
-            loop={"unroll": 128} if on_policy else OFF,
+            learner=task.learner,
+            loop=task.loop,
             callbacks=[lambda moment: seen.append((moment.env_steps, moment.seconds, moment.compile_seconds))],
             quiet=True,
         )
@@ -171,7 +198,7 @@ def main() -> None:
     """Measure one thing."""
     parser = argparse.ArgumentParser()
     parser.add_argument("task", choices=TASKS)
-    parser.add_argument("name", nargs="?", choices=["ppo", "dqn"], default="ppo")
+    parser.add_argument("name", nargs="?", choices=TRAINED, default="ppo")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=5)

@@ -12,7 +12,9 @@ import gymnasium
 import pytest
 
 import rewardtogo as rtg
+from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.registry import COMPILED
+from rewardtogo.envs.time_limit import FiniteHorizon
 from rewardtogo.runner.evaluate_run import evaluate_run
 
 pytestmark = pytest.mark.slow
@@ -81,3 +83,26 @@ def test_score(claim: Claim, tmp_path: Path, item: Any) -> None:
             )
             check(reached, ">=", claim.seeds, f"{claim}: seeds that reach it")
     assert reached >= claim.seeds, scores
+
+
+def test_batch_actor_critic_without_a_discount(tmp_path: Path, item: Any) -> None:
+    """Algorithm 3 has gamma = 1, which makes sense where an episode ends: time limit an end, and seen (erratum E1.2).
+
+    V is fitted to lambda-returns: with Monte-Carlo sums of rollouts that cut episodes two seeds of five got there.
+    """
+    runs = rtg.train(
+        "batch_ac",
+        FiniteHorizon(CartPole(), 500),
+        steps=300_000,
+        num_seeds=SEEDS,
+        num_envs=8,
+        loop={"unroll": 128},
+        learner={"gamma": 1.0, "value_target": "td_lambda"},
+        preset="none",
+        out=tmp_path / "run",
+        quiet=True,
+    )
+    scores = [run.evaluation["return_mean"] for run in runs]
+    with item("4.15") as check:
+        check(statistics.median(scores), ">=", 475, f"batch_ac, gamma 1: median return of {SEEDS} seeds, 300,000 steps")
+        check(sum(score >= 475 for score in scores), ">=", 4, "seeds that reach it")

@@ -18,6 +18,7 @@ from .tabular import MDP as MDP
 from .tabular import POMDP as POMDP
 from .tabular import TabularEnv as TabularEnv
 from .tabular import TabularModel as TabularModel
+from .time_limit import FiniteHorizon as FiniteHorizon
 from .time_limit import TimeLimit as TimeLimit
 from .vectorize import Vectorized as Vectorized
 from .vectorize import vectorize as vectorize

@@ -14,6 +14,7 @@ from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
 from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
+from .reward_wrappers import NormalizeReward
 from .time_limit import TimeLimit
 from .vectorize import vectorize
 from .wrappers import MaskObservation
@@ -36,7 +37,14 @@ COMPILED: dict[str, Callable[[], Environment]] = {
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 
 
-def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **kwargs: Any) -> VectorEnv:
+def make(
+    env: Any,
+    num_envs: int | None = None,
+    *,
+    backend: Backend = "auto",
+    normalise_reward: float | None = None,
+    **kwargs: Any,
+) -> VectorEnv:
     """B environments side by side.
 
     - `env`: a Gymnasium id (`module:Id` included), one of ours (`rtg list --envs`), a function that makes an environment, a
@@ -44,10 +52,18 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
     - `num_envs`: B, 1 if not given.
     - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"envpool"` for EnvPool's (extra
       `envpool`), `"auto"` for the twin where there is one, else Gymnasium's.
+    - `normalise_reward`: a discount in [0, 1]; rewards are then divided by the running standard deviation of the sums that they
+      make with it (`NormalizeReward`). Returns that are reported stay the environment's own.
     - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own.
 
     Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
     """
+    if normalise_reward is not None:
+        if isinstance(normalise_reward, bool) or not isinstance(normalise_reward, (int, float)):
+            raise ValueError(
+                f"normalise_reward is a discount, a number in [0, 1] such as 0.99, not {normalise_reward!r}"
+            )
+        return NormalizeReward(make(env, num_envs, backend=backend, **kwargs), float(normalise_reward))
     if backend not in BACKENDS:
         raise ValueError(f"there is no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if isinstance(env, VectorEnv):

@@ -23,7 +23,7 @@ from ..envs.gymnasium import GymnasiumEnv, hosted
 from ..loops.collect import begin, collect
 from ..loops.off_policy import OffPolicy, OffPolicyState
 from ..loops.on_policy import OnPolicy
-from .evaluate import Evaluator
+from .evaluate import Either, Evaluator
 from .evaluate_run import restore
 from .folder import RunFolder
 from .plan import Plan
@@ -139,7 +139,7 @@ def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
     evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, plan.config["eval_episodes"])
     # Copies, since the programs below reuse the memory of the state; the same ones and the same key, so that evaluation plays
     # the same episodes each time.
-    policies = [jax.tree.map(jnp.copy, algorithm.policy(state, explore)) for explore in (False, True)]
+    policies = [jax.tree.map(jnp.copy, Either.of(algorithm, state, explore)) for explore in (False, True)]
 
     def evaluate() -> None:
         if evaluator is not None:
