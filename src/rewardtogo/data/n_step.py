@@ -38,7 +38,7 @@ def n_step(
     """
 
     def one(t: Transition, stop: Array | None, ratio: Array | None) -> Transition:
-        discount = gamma * (1.0 - t.terminated.astype(jnp.float32))
+        discount = gamma * (1.0 - t.terminated.astype(t.reward.dtype))
         total, product, last = n_step_transition(t.reward, discount, t.done if stop is None else t.done | stop)
         first = lambda tree: jax.tree.map(lambda x: x[0], tree)  # noqa: E731
         following = jax.tree.map(lambda x: x[last], t.next_observation)

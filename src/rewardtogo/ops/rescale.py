@@ -14,7 +14,8 @@ EPSILON = 1e-3
 
 def compress(x: Float[Array, "*S"], epsilon: float = EPSILON) -> Float[Array, "*S"]:
     """h(x)."""
-    return jnp.sign(x) * (jnp.sqrt(jnp.abs(x) + 1.0) - 1.0) + epsilon * x
+    # The difference sqrt(|x| + 1) - 1, without losing the digits of a small x.
+    return x / (jnp.sqrt(jnp.abs(x) + 1.0) + 1.0) + epsilon * x
 
 
 def expand(x: Float[Array, "*S"], epsilon: float = EPSILON) -> Float[Array, "*S"]:

@@ -134,10 +134,9 @@ class DQN(Learner):
         return DQNState(network, network, optimiser, norm, jnp.zeros((), jnp.int32))
 
     def policy(self, state: DQNState, explore: bool) -> GreedyPolicy:
-        now = self.at(state.updates)
-        epsilon = jnp.asarray(now.epsilon if explore else 0.0, jnp.float32)
+        epsilon = jnp.asarray(self.at(state.updates).epsilon if explore else 0.0, jnp.float32)
         # A policy is saved as arrays.
-        outputs = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), now.outputs)
+        outputs = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), self.outputs.at(state.updates))
         return GreedyPolicy(
             state.network, outputs, state.norm, epsilon, explore and self.noisy, explore and self._keeps_probabilities
         )
