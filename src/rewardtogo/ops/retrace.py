@@ -52,6 +52,6 @@ def trace_coefficients(
 ) -> Float[Array, "*S"]:
     """The c of actions that pi takes with probability `pi_t` and mu took with `mu_t`."""
     if kind == "tree_backup":
-        return lambda_ * pi_t
+        return pi_t * lambda_
     ratio = pi_t / mu_t
-    return lambda_ * (jnp.minimum(ratio, 1.0) if kind == "retrace" else ratio)
+    return (jnp.minimum(ratio, 1.0) if kind == "retrace" else ratio) * lambda_

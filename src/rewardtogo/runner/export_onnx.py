@@ -112,12 +112,12 @@ def _network(policy: Policy) -> tuple[Torso, Linear]:
         return policy.network.actor, policy.network.head.linear
     if isinstance(policy, GreedyPolicy):
         head = policy.network.head
-        if not isinstance(policy.outputs, Expectation) or head.value or len(head.layers) > 1:
+        *hidden, last = head.layers
+        if not isinstance(policy.outputs, Expectation) or head.value or hidden:
             raise ValueError(
                 "ONNX is written for one Q value an action from one layer, not for dueling, deep or distributional heads: "
                 "use --format stablehlo"
             )
-        last = head.layers[0]
         return policy.network.torso, last if isinstance(last, Linear) else last.mean
     raise ValueError(f"ONNX cannot be written for a {type(policy).__name__}: use --format stablehlo")
 

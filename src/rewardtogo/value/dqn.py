@@ -39,7 +39,7 @@ from ..ops.retrace import TRACES, Trace
 from ..ops.schedules import Linear as LinearSchedule
 from .outputs import Expectation, Outputs
 from .q_network import GreedyPolicy, QNetwork, expected, over
-from .targets import CORRECTIONS, Correction, bootstrapped, corrections, look, outputs_at, traced
+from .targets import CORRECTIONS, Correction, bootstrapped, corrections, look, outputs_at, towards, traced
 
 PEAK = 0.9
 """Weight of the largest error of a sequence in its priority; the rest is their mean's (R2D2)."""
@@ -171,7 +171,8 @@ class DQN(Learner):
             "grad_norm": global_norm(gradient),
             "epsilon": now.epsilon,
         }
-        state = DQNState(network, now._moved(state.target, network, updates), optimiser, norm, updates)
+        tau = jnp.where(updates % self.target_period == 0, now.target_rate, 0.0)
+        state = DQNState(network, towards(state.target, network, tau), optimiser, norm, updates)
         size = jnp.abs(error)
         return state, metrics, size if size.ndim == 1 else PEAK * size.max(0) + (1.0 - PEAK) * size.mean(0)
 
@@ -197,11 +198,6 @@ class DQN(Learner):
         if self.traces == "none":
             return bootstrapped(self.outputs, steps, self.gamma, self.double)
         return traced(self.outputs, steps, self.gamma, self.double, self.traces, self.trace_decay, self.target_epsilon)
-
-    def _moved(self, target: QNetwork, network: QNetwork, updates: Int[Array, ""]) -> QNetwork:
-        """The target network after this many updates."""
-        tau = jnp.where(updates % self.target_period == 0, self.target_rate, 0.0)
-        return jax.tree.map(lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), target, network)
 
     def _rule(self) -> Optimiser:
         return Optimiser(self.learning_rate, self.max_grad_norm, rule=self.optimiser)

@@ -68,7 +68,7 @@ def check_values(
 
 def compare(t: Transition, gamma: ScalarLike, tolerance: float = 0.01) -> ValueCheck:
     """The same for steps `[T, B]` whose `extras["value"]` says what was thought of each observation."""
-    discount = gamma * (1.0 - t.terminated)
+    discount = (1.0 - t.terminated) * gamma
     returns, missing = jax.vmap(known_returns, 1, 1)(t.reward, discount, t.done)
     counts = (missing <= tolerance).astype(jnp.float32)
     states = counts.sum()

@@ -141,7 +141,7 @@ def greedy_probabilities(
     mask = action_mask(observation)
     allowed = jnp.ones_like(q) if mask is None else (mask > 0).astype(q.dtype)
     best = jax.nn.one_hot(jnp.argmax(q, -1), q.shape[-1], dtype=q.dtype)
-    return (1.0 - epsilon) * best + epsilon * allowed / allowed.sum(-1, keepdims=True)
+    return best * (1.0 - epsilon) + allowed / allowed.sum(-1, keepdims=True) * epsilon
 
 
 class GreedyPolicy(Policy):

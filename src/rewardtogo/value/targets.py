@@ -12,7 +12,7 @@ $$y_t = \sum_{k<n} \gamma^k r_{t+k} + \gamma^n Q_\text{target}(s_{t+n}, \arg\max
 Or use sequences as a whole, with traces (`ops.retrace`): Retrace, tree backup or importance sampling.
 """
 
-from typing import Literal
+from typing import Literal, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,6 +27,9 @@ from .q_network import QNetwork, expected, greedy_probabilities, over
 
 Correction = Literal["none", "adaptive", "importance"]
 CORRECTIONS = ("none", "adaptive", "importance")
+
+
+Parameters = TypeVar("Parameters")
 
 
 class Seen(eqx.Module):
@@ -67,6 +70,11 @@ def behaviour(t: Transition) -> Float[Array, "*N"]:
             "use data of this library's own policies, kept in a replay, or traces='tree_backup', which needs none"
         )
     return t.extras["log_prob"]
+
+
+def towards(target: Parameters, network: Parameters, tau: Number) -> Parameters:
+    """The rule phi' <- (1 - tau) phi' + tau phi: where the target network moves; at tau = 1 exactly to the network."""
+    return jax.tree.map(lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), target, network)
 
 
 def at_action(values: Float[Array, "*N A"], action: Array) -> Float[Array, "*N"]:
