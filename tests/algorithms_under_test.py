@@ -87,6 +87,16 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     ),
     "dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2, normalise_observations=True)),
     "dqn-n-step": lambda: off_policy(rtg.DQN(network=small, n_step=3, target_period=2)),
+    "c51-dueling-noisy": lambda: off_policy(
+        rtg.DQN(
+            network=small, outputs=rtg.C51(5), head_sizes=(6,), dueling=True, noisy=True, epsilon=0.1, target_period=2
+        )
+    ),
+    "qr-dqn": lambda: off_policy(rtg.DQN(network=small, outputs=rtg.Quantiles(5), target_period=2)),
+    "retrace-q": lambda: off_policy(rtg.DQN(network=small, traces="retrace", target_period=2)),
+    "r2d2": lambda: off_policy(
+        rtg.DQN(network=lstm, burn_in=1, n_step=2, double=True, outputs=rtg.Expectation(rescale=True), target_period=2)
+    ),
     "dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, double=True, target_period=1, target_rate=0.1)),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),

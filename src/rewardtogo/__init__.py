@@ -59,6 +59,9 @@ if TYPE_CHECKING:
     from .runner.train import resume as resume
     from .runner.train import train as train
     from .value.dqn import DQN as DQN
+    from .value.outputs import C51 as C51
+    from .value.outputs import Expectation as Expectation
+    from .value.outputs import Quantiles as Quantiles
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
@@ -84,6 +87,7 @@ _HOMES = {
     "runner.policy": "load",
     "runner.train": "Run resume train",
     "value.dqn": "DQN",
+    "value.outputs": "C51 Expectation Quantiles",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (

@@ -27,6 +27,7 @@ class Row:
 
 ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 _VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
+_DQN = "rewardtogo.value.dqn:DQN"
 _ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
 
 ALGORITHMS: dict[str, Row] = {
@@ -166,12 +167,106 @@ ALGORITHMS: dict[str, Row] = {
         ),
         Row(
             "dqn",
-            "rewardtogo.value.dqn:DQN",
+            _DQN,
             "off_policy",
             "6",
             "Alg 13",
             ("discrete",),
             "deep Q-learning with replay and target network, double or plain",
+        ),
+        Row(
+            "q_replay",
+            _DQN,
+            "off_policy",
+            "6",
+            "Alg 11",
+            ("discrete",),
+            "Q-learning with a replay and no target network",
+            {"target_period": 1},
+        ),
+        Row(
+            "target_q",
+            _DQN,
+            "off_policy",
+            "6",
+            "Alg 12",
+            ("discrete",),
+            "Q-learning with replay and target network, several updates for each step",
+            {"target_period": 256},
+            {"unroll": 1, "updates": 4},
+        ),
+        Row(
+            "double_dqn",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.3.1",
+            ("discrete",),
+            "DQN whose online network chooses the action that the target network values",
+            {"double": True},
+        ),
+        Row(
+            "dueling_dqn",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "double DQN with streams for the value of the state and the advantages of actions",
+            {"dueling": True, "double": True, "network": {"class": "mlp", "sizes": [64], "activation": "relu"}}
+            | {"head_sizes": [64]},
+        ),
+        Row(
+            "noisy_dqn",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "double DQN that explores by learned noise in its weights",
+            {"noisy": True, "epsilon": 0.0, "double": True, "head_sizes": [64]}
+            | {"network": {"class": "mlp", "sizes": [64], "activation": "relu"}},
+        ),
+        Row(
+            "c51",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "distributional Q-learning: probabilities of fixed returns",
+            {"outputs": {"class": "c51"}},
+        ),
+        Row(
+            "qr_dqn",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "distributional Q-learning: quantiles of the return",
+            {"outputs": {"class": "quantiles"}},
+        ),
+        Row(
+            "r2d2",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "double DQN with a memory: stored states, burn-in, rescaled values",
+            {"network": {"class": "lstm"}, "burn_in": 4, "n_step": 3, "double": True, "dueling": True}
+            | {"outputs": {"class": "expectation", "rescale": True}},
+        ),
+        Row(
+            "retrace_q",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.19",
+            ("discrete",),
+            "Q-learning from whole sequences of older policies' actions, by Retrace(lambda)",
+            {"traces": "retrace"},
         ),
     )
 }

@@ -15,7 +15,7 @@ KEY = jax.random.key(0)
 
 
 def loop(kind: str = "transitions", capacity: int = 40, **options: int) -> rtg.OffPolicy:
-    options = {"unroll": 3, "warm_up": 20, "batch_size": 64, "length": 8} | options
+    options = {"unroll": 3, "warm_up": 20, "batch_size": 32, "length": 8} | options
     return rtg.OffPolicy(ENV, Recorder(kind), rtg.UniformReplay(capacity), **options)
 
 
@@ -43,7 +43,7 @@ def test_batches_are_consecutive_steps_that_happened(kind):
         np.testing.assert_array_equal(t.next_observation, t.observation + 1)
         np.testing.assert_array_equal(t.terminated, t.observation[..., 0] == 4)
         if kind == "sequences":
-            assert t.reward.shape == (8, 64)
+            assert t.reward.shape == (8, 32)
             np.testing.assert_array_equal(t.observation[1:, :, 0], (t.observation[:-1, :, 0] + 1) % 5)
             np.testing.assert_array_equal(t.extras["carry"], t.observation[..., 0])
             age = np.asarray(t.extras["updates"])
@@ -57,9 +57,9 @@ def test_batches_are_consecutive_steps_that_happened(kind):
 
 
 def test_every_row_is_drawn():
-    off = loop(batch_size=2000)
-    _, (metrics, _) = jit(lambda k: off.step(off.init(k), k))(KEY)
-    counts = np.bincount(np.asarray(metrics["batch"].indices), minlength=30)
+    off = loop()
+    batch = jit(lambda k: off.replay.sample(off.step(off.init(k), k)[0].replay, k, 2000))(KEY)
+    counts = np.bincount(np.asarray(batch.indices), minlength=30)
     assert len(counts) == 30
     assert counts.min() > 30
     assert counts.max() < 110
@@ -98,7 +98,8 @@ def test_warm_up_is_long_enough_for_a_sequence():
     ("kind", "options", "match"),
     [
         ("transitions", {"capacity": 5}, "capacity of at least 6"),
-        ("sequences", {"capacity": 12}, "holds no sequence of 8 steps"),
+        ("transitions", {"batch_size": 41}, "smaller than a batch of 41"),
+        ("sequences", {"capacity": 12, "batch_size": 4}, "holds no sequence of 8 steps"),
         ("sequences", {"unroll": 0}, "OffPolicy.unroll must be"),
         ("transitions", {"unroll": 0}, "OffPolicy.unroll must be"),
         ("transitions", {"batch_size": 0}, "OffPolicy.batch_size must be"),
@@ -115,6 +116,6 @@ def test_what_cannot_be_is_refused(kind, options, match):
 def test_the_advice_about_capacity_is_good():
     """What the error says would do, does."""
     with pytest.raises(ValueError, match="at least") as error:
-        loop("sequences", capacity=12)
+        loop("sequences", capacity=12, batch_size=4)
     advice = int(str(error.value).split("at least ")[1])
-    loop("sequences", capacity=advice)
+    loop("sequences", capacity=advice, batch_size=4)

@@ -17,7 +17,7 @@ from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops.collect import begin, collect
 from rewardtogo.nn import ActorCritic, ActorCriticPolicy
-from rewardtogo.value.dqn import QNetwork
+from rewardtogo.value.q_network import QNetwork
 
 ENV = rtg.vectorize(TimeLimit(CartPole(), 14), 8)
 LENGTH = 40

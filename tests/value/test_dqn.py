@@ -23,7 +23,7 @@ W_TARGET = np.array([[2.0, 1.0], [0.5, -1.0], [1.0, 1.0]], np.float32)
 
 def state_of(learner: Any, weight: np.ndarray = W, target: np.ndarray = W_TARGET) -> DQNState:
     state = learner.init(SPEC, KEY)
-    put = lambda n, w: eqx.tree_at(lambda n: n.head.weight, n, jnp.asarray(w))  # noqa: E731
+    put = lambda n, w: eqx.tree_at(lambda n: n.head.layers[0].weight, n, jnp.asarray(w))  # noqa: E731
     return eqx.tree_at(lambda s: (s.network, s.target), state, (put(state.network, weight), put(state.target, target)))
 
 
@@ -69,7 +69,9 @@ def test_targets_are_those_worked_out_by_hand(double):
     expected = np.zeros((3, 2))
     for s, a, e, w in zip(S, A, error, weights, strict=True):
         expected[a] += w * e * s / 3
-    np.testing.assert_allclose(first_gradient(new.optimiser, new.network).head.weight, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        first_gradient(new.optimiser, new.network).head.layers[0].weight, expected, rtol=1e-4, atol=1e-6
+    )
 
 
 def test_errors_beyond_the_huber_threshold_count_linearly():
@@ -96,7 +98,7 @@ def test_the_target_is_copied_at_the_period():
         before, state = state.target, update(state, batch())
         if i % 3:
             jax.tree.map(np.testing.assert_array_equal, state.target, before)
-            assert not np.array_equal(state.target.head.weight, state.network.head.weight)
+            assert not np.array_equal(state.target.head.layers[0].weight, state.network.head.layers[0].weight)
         else:
             jax.tree.map(np.testing.assert_array_equal, state.target, state.network)
     assert int(state.updates) == 6
@@ -106,8 +108,8 @@ def test_the_target_follows_by_polyak_averaging():
     learner = rtg.DQN(network=LINEAR, target_period=1, target_rate=0.25, epsilon=0.1)
     state = state_of(learner)
     new = jit(lambda s, b: learner.update(s, b, KEY)[0])(state, batch())
-    expected = 0.75 * W_TARGET + 0.25 * np.asarray(new.network.head.weight)
-    np.testing.assert_allclose(new.target.head.weight, expected, rtol=1e-6)
+    expected = 0.75 * W_TARGET + 0.25 * np.asarray(new.network.head.layers[0].weight)
+    np.testing.assert_allclose(new.target.head.layers[0].weight, expected, rtol=1e-6)
 
 
 def test_a_fresh_target_is_the_network():
@@ -162,7 +164,9 @@ def test_a_masked_action_is_not_bootstrapped_from():
     learner = rtg.DQN(network=LINEAR, gamma=0.9, epsilon=0.1)
     state = learner.init(spec, KEY)
     state = eqx.tree_at(
-        lambda s: (s.network.head.weight, s.target.head.weight), state, (jnp.asarray(W), jnp.asarray(W_TARGET))
+        lambda s: (s.network.head.layers[0].weight, s.target.head.layers[0].weight),
+        state,
+        (jnp.asarray(W), jnp.asarray(W_TARGET)),
     )
     masks = np.array([[0, 1, 1], [1, 1, 1], [0, 1, 0]], np.int8)
     b = batch()
@@ -191,5 +195,5 @@ def test_standardised_observations_are_part_of_the_state():
     q = policy.inspect(policy.init(KEY), jnp.asarray(S[0]))["q_values"]
     seen = (S[0] - S.mean(0)) / np.sqrt(S.var(0) + 1e-8)
     np.testing.assert_allclose(
-        q, np.asarray(new.network.head.weight) @ seen + np.asarray(new.network.head.bias), rtol=1e-5
+        q, np.asarray(new.network.head.layers[0].weight) @ seen + np.asarray(new.network.head.layers[0].bias), rtol=1e-5
     )

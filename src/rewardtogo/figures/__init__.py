@@ -27,6 +27,10 @@ FIGURES = {
         "bias_variance",
         "bias and variance of n-step and lambda-returns, and what n and lambda do to learning",
     ),
+    "6.2": (
+        "q_processes",
+        "Q-learning in general: collecting, regressing and moving the target as processes with rates, of Algorithms 9 to 13",
+    ),
     "7.1": (
         "fisher_ellipse",
         "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",

@@ -18,6 +18,8 @@ from .network import Linear as Linear
 from .network import Network as Network
 from .network import Torso as Torso
 from .network import as_network as as_network
+from .noisy import NoisyLinear as NoisyLinear
+from .noisy import perturbed as perturbed
 from .optimise import RULES as RULES
 from .optimise import Optimiser as Optimiser
 from .optimise import global_norm as global_norm

@@ -4,6 +4,9 @@ from .advantages import gae as gae
 from .advantages import gae_weights as gae_weights
 from .advantages import n_step_advantages as n_step_advantages
 from .advantages import normalise as normalise
+from .distributional import categorical_projection as categorical_projection
+from .distributional import quantile_huber as quantile_huber
+from .distributional import quantile_levels as quantile_levels
 from .distributions import Bernoulli as Bernoulli
 from .distributions import Categorical as Categorical
 from .distributions import DiagGaussian as DiagGaussian
@@ -29,6 +32,11 @@ from .importance import normalised_weights as normalised_weights
 from .importance import self_normalised_mean as self_normalised_mean
 from .linalg import conjugate_gradients as conjugate_gradients
 from .linalg import inner as inner
+from .rescale import compress as compress
+from .rescale import expand as expand
+from .retrace import TRACES as TRACES
+from .retrace import retrace as retrace
+from .retrace import trace_coefficients as trace_coefficients
 from .returns import lambda_returns as lambda_returns
 from .returns import n_step_returns as n_step_returns
 from .returns import reward_to_go as reward_to_go

@@ -16,7 +16,8 @@ from ..nn import ActorCriticPolicy, RunningNorm
 from ..nn.encoding import input_parts
 from ..nn.heads import centre, half_width
 from ..nn.network import Linear, MLPTorso, Torso
-from ..value.dqn import GreedyPolicy
+from ..value.outputs import Expectation
+from ..value.q_network import GreedyPolicy
 
 OPSET = 20
 TYPES = {"float32": "FLOAT", "int32": "INT64", "int8": "INT8", "uint8": "UINT8"}
@@ -110,7 +111,14 @@ def _network(policy: Policy) -> tuple[Torso, Linear]:
     if isinstance(policy, ActorCriticPolicy):
         return policy.network.actor, policy.network.head.linear
     if isinstance(policy, GreedyPolicy):
-        return policy.network.torso, policy.network.head
+        head = policy.network.head
+        *hidden, last = head.layers
+        if not isinstance(policy.outputs, Expectation) or head.value or hidden:
+            raise ValueError(
+                "ONNX is written for one Q value an action from one layer, not for dueling, deep or distributional heads: "
+                "use --format stablehlo"
+            )
+        return policy.network.torso, last if isinstance(last, Linear) else last.mean
     raise ValueError(f"ONNX cannot be written for a {type(policy).__name__}: use --format stablehlo")
 
 
