@@ -173,6 +173,17 @@ ALGORITHMS: dict[str, Row] = {
             ("discrete",),
             "deep Q-learning with replay and target network, double or plain",
         ),
+        Row(
+            "per_dqn",
+            "rewardtogo.value.dqn:DQN",
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "deep Q-learning that replays steps with large errors more often",
+            {},
+            {"replay": {"class": "prioritised"}},
+        ),
     )
 }
 

@@ -190,7 +190,7 @@ class DQN(Learner):
 
     def update(
         self, state: DQNState, batch: Batch, key: PRNGKey
-    ) -> tuple[DQNState, dict[str, Array], Float[Array, "N"]]:
+    ) -> tuple[DQNState, dict[str, Array], Float[Array, "*T N"]]:
         del key
         now, t = self.at(state.updates), batch.transitions
         norm = None if state.norm is None else state.norm.update(t.observation)
@@ -230,7 +230,7 @@ class DQN(Learner):
             "grad_norm": global_norm(gradient),
             "epsilon": now.epsilon,
         }
-        return DQNState(network, target, optimiser, norm, updates), metrics, by_sample(jnp.abs(error))
+        return DQNState(network, target, optimiser, norm, updates), metrics, jnp.abs(error)
 
     def _optimiser(self) -> Optimiser:
         return Optimiser(self.learning_rate, self.max_grad_norm)
