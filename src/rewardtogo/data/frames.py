@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt8
 
-ENDINGS = 1 / 8
+ENDINGS = 1 / 32
 """Room for the last pictures of episodes, as a part of the rows."""
 
 
@@ -139,7 +139,7 @@ def read(
     age = (position - 1 - row) % rows
     place = state.position - 1 - age
     since, ending = state.since[row, env].astype(jnp.int32), state.ending[row, env]
-    back = jnp.arange(frames - 1, -1, -1)
+    back = jnp.broadcast_to(jnp.arange(frames - 1, -1, -1), (*row.shape, frames))
     from_start = jnp.minimum(back, since[..., None])
     stack = state.pictures[(place[..., None] - from_start) % size, env[..., None]]
     hidden = state.blank[row, env][..., None] & (back > since[..., None])

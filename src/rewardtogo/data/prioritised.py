@@ -107,7 +107,9 @@ class PrioritisedReplay(Replay):
         error = jnp.abs(priorities)
         if error.ndim > 1:
             error = now.mix * error.max(0) + (1.0 - now.mix) * error.mean(0)
-        power = (error + now.offset) ** now.alpha
+        # What must not be learnt from (weight 0) is not drawn again. It also makes the write of new priorities wait for the last
+        # look at the old ones, without which XLA copies the whole tree.
+        power = jnp.where(batch.weights > 0, (error + now.offset) ** now.alpha, 0.0)
         tree = sum_tree.assign(order.tree, batch.indices, power)
         largest = jnp.maximum(order.largest, power.max())
         return dataclasses.replace(state, order=Priorities(tree, largest, order.batches + 1, order.length))
