@@ -136,13 +136,13 @@ def test_weights_make_expectations_those_of_uniform_draws(item):
     state = filled()
     batch = jit(lambda s: whole.sample(s, KEY, 50_000))(state)
     p = leaves(state).ravel().astype(np.float64)
-    weighted = float((batch.weights * batch.transitions.reward).mean() / batch.weights.mean())
-    mean = float(np.asarray(state.storage.reward).mean())
+    place = np.asarray(batch.indices, np.float64)
+    weighted, mean = float((batch.weights * place).mean() / batch.weights.mean()), (ROWS * ENVS - 1) / 2
     with item("6.28") as check:
         expected = len(p) * (p / p.sum()).min()
         check(abs(float(batch.weights.mean()) / expected - 1), "<=", 1e-3, "mean weight against N min P")
-        check(abs(weighted / mean - 1), "<=", 1e-3, "weighted mean of the rewards against that of the memory")
-        check(abs(float(batch.transitions.reward.mean()) / mean - 1), ">", 0.05, "unweighted it is another")
+        check(abs(weighted / mean - 1), "<=", 1e-3, "weighted mean of the places against that of the memory")
+        check(abs(float(place.mean()) / mean - 1), ">", 0.05, "unweighted it is another")
 
 
 def test_alpha_0_draws_uniformly_with_weights_1():
