@@ -36,9 +36,9 @@ def on_policy(learner: Any, **options: Any) -> Algorithm:
     return rtg.OnPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, **{"unroll": 8, **options})
 
 
-def off_policy(learner: Any, **options: Any) -> Algorithm:
+def off_policy(learner: Any, replay: Any = rtg.UniformReplay(256), **options: Any) -> Algorithm:
     options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
-    return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, rtg.UniformReplay(256), **options)
+    return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, replay, **options)
 
 
 @functools.cache
@@ -86,6 +86,8 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
         "random",
     ),
     "dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2, normalise_observations=True)),
+    "per-dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2), rtg.PrioritisedReplay(256)),
+    "per-dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, target_period=2), rtg.PrioritisedReplay(256)),
     "dqn-n-step": lambda: off_policy(rtg.DQN(network=small, n_step=3, target_period=2)),
     "c51-dueling-noisy": lambda: off_policy(
         rtg.DQN(

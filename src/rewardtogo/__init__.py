@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from .core import number as number
     from .core import part as part
     from .core import setting as setting
+    from .data.prioritised import PrioritisedReplay as PrioritisedReplay
+    from .data.replay import Replay as Replay
     from .data.replay import UniformReplay as UniformReplay
     from .envs.gymnasium import EnvironmentFailure as EnvironmentFailure
     from .envs.gymnasium import GymnasiumEnv as GymnasiumEnv
@@ -67,7 +69,8 @@ _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
     "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
     "number part setting",
-    "data.replay": "UniformReplay",
+    "data.prioritised": "PrioritisedReplay",
+    "data.replay": "Replay UniformReplay",
     "envs.gymnasium": "EnvironmentFailure GymnasiumEnv",
     "envs.registry": "make",
     "envs.vectorize": "vectorize",

@@ -268,6 +268,17 @@ ALGORITHMS: dict[str, Row] = {
             "Q-learning from whole sequences of older policies' actions, by Retrace(lambda)",
             {"traces": "retrace"},
         ),
+        Row(
+            "per_dqn",
+            _DQN,
+            "off_policy",
+            "6",
+            "6.28",
+            ("discrete",),
+            "deep Q-learning that replays steps with large errors more often",
+            {},
+            {"replay": {"class": "prioritised"}},
+        ),
     )
 }
 

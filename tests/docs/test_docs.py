@@ -151,7 +151,10 @@ def test_command_is_one(page, line, monkeypatch):
 
 def known_options() -> set[str]:
     """Every option of every command, algorithm, loop and part."""
-    found = set().union(*OPTIONS.values(), {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY", "--env.normalise-reward"})
+    found = set().union(
+        *OPTIONS.values(),
+        {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY", "--env.normalise-reward"},
+    )
     found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD"}
     classes = [("learner", class_of(name)) for name in ALGORITHMS] + [
         ("loop", resolve(path)) for path in LOOPS.values()

@@ -14,7 +14,7 @@ from ..catalogue import LOOPS, algorithm_row
 from ..core import Schedule
 from ..envs.gymnasium import EnvironmentFailure
 from ..ops.schedules import to_text
-from ..runner.config import PARTS, merge, options, resolve
+from ..runner.config import PARTS, merge, options, part_of, resolve
 from ..runner.engine import NonFinite
 from ..runner.train import Interrupted, Run, resume, train
 from .main import INTERRUPTED, WRONG, RequestError, _say
@@ -290,15 +290,20 @@ def show_options(algorithm: str) -> None:
                 f"  --{title}.{name.replace('_', '-')} {_shown(settings.get(name, field.default))}{limits}\n      {field.metadata['doc']}"
             )
             if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
-                for inner in options(type(field.default)):
+                chosen = part_of(name, field, settings.get(name, field.default))
+                for inner in options(type(chosen)):
                     print(
-                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(field.default, inner))}"
+                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(chosen, inner))}"
                     )
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, Schedule):
         return to_text(value)
+    if isinstance(value, dict):  # a part, of which some options are set
+        return " ".join(
+            [*([value["class"]] if "class" in value else []), *(f"{k} {v}" for k, v in value.items() if k != "class")]
+        )
     if isinstance(value, tuple):
         return " ".join(map(str, value))
     if dataclasses.is_dataclass(value):

@@ -134,7 +134,9 @@ class Learner(Configured):
 
     @abstractmethod
     def update(self, state: State, batch: Any, key: PRNGKey) -> tuple[State, dict[str, Array], Array | tuple[()]]:
-        """Learn from a `Rollout` or a `Batch`: new state, scalar metrics, and priorities by sample (or `()`)."""
+        """Learn from a `Rollout` or a `Batch`: new state, scalar metrics, and priorities by sample, `[N]` or of each step `[T, N]`
+        (or `()`).
+        """
 
 
 class Algorithm(eqx.Module):

@@ -253,19 +253,5 @@ def _learning(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollo
         learner, metrics, _ = algorithm.learner.update(state.learner, rollout, key)
         return eqx.tree_at(lambda s: s.learner, state, learner), metrics
     replay = algorithm.replay.add(state.replay, rollout.transitions)
-
-    def update(learner: State, key: PRNGKey) -> tuple[State, dict[str, jax.Array]]:
-        sample_key, update_key = jax.random.split(key)
-        if algorithm.learner.batch == "sequences":
-            batch = algorithm.replay.sample_sequences(replay, sample_key, algorithm.batch_size, algorithm.length)
-        else:
-            batch = algorithm.replay.sample(replay, sample_key, algorithm.batch_size)
-        learner, metrics, _ = algorithm.learner.update(learner, batch, update_key)
-        return learner, metrics
-
-    if algorithm.updates == 1:
-        learner, metrics = update(state.learner, key)
-    else:
-        learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(key, algorithm.updates))
-        metrics = jax.tree.map(jnp.mean, metrics)
+    learner, replay, metrics = algorithm.learn(state.learner, replay, key)
     return OffPolicyState(learner, state.actor, replay), metrics
