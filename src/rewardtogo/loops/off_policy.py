@@ -15,6 +15,7 @@ from ..core import (
     Learner,
     Policy,
     PRNGKey,
+    Rollout,
     State,
     VectorEnv,
     env_spec,
@@ -139,15 +140,26 @@ class OffPolicy(Algorithm, Configured):
         return OffPolicyState(learner, actor, replay)
 
     def step(self, state: OffPolicyState, key: PRNGKey) -> tuple[OffPolicyState, tuple[dict[str, jax.Array], Episodes]]:
-        collect_key, learn_key = jax.random.split(key)
-        policy = self.learner.policy(state.learner, explore=True)
-        actor, rollout, episodes = collect(self.env, policy, state.actor, collect_key, self.unroll, self._sequential)
-        replay = self.replay.add(state.replay, rollout.transitions)
+        act_key, learn_key = jax.random.split(key)
+        state, rollout, episodes = self.act(state, act_key)
+        state, metrics = self.learn(state, rollout, learn_key)
+        return state, (metrics, episodes)
 
-        learner, replay, metrics = self.learn(state.learner, replay, learn_key)
-        return OffPolicyState(learner, actor, replay), (metrics, episodes)
+    def act(self, state: OffPolicyState, key: PRNGKey) -> tuple[OffPolicyState, Rollout, Episodes]:
+        """The first half of an iteration: steps in the environments."""
+        policy = self.learner.policy(state.learner, explore=True)
+        actor, rollout, episodes = collect(self.env, policy, state.actor, key, self.unroll, self._sequential)
+        return OffPolicyState(state.learner, actor, state.replay), rollout, episodes
 
     def learn(
+        self, state: OffPolicyState, rollout: Rollout, key: PRNGKey
+    ) -> tuple[OffPolicyState, dict[str, jax.Array]]:
+        """The second half: the steps go into the memory, and batches from there to the learner."""
+        replay = self.replay.add(state.replay, rollout.transitions)
+        learner, replay, metrics = self._updates(state.learner, replay, key)
+        return OffPolicyState(learner, state.actor, replay), metrics
+
+    def _updates(
         self, learner: State, replay: ReplayState, key: PRNGKey
     ) -> tuple[State, ReplayState, dict[str, jax.Array]]:
         """The updates of one iteration: the learner, the replay, and the mean of the metrics."""
