@@ -74,13 +74,20 @@ PRESETS: dict[tuple[str, str], Preset] = {
     ("double_dqn", "CartPole-v1"): _DQN_CARTPOLE,
     ("dueling_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64]),
     ("noisy_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64], epsilon=0.0),
-    ("c51", "CartPole-v1"): _dqn_cartpole(outputs={"class": "c51", "least": 0.0, "most": 100.0}),
-    ("qr_dqn", "CartPole-v1"): _dqn_cartpole(outputs={"class": "quantiles", "count": 32}, huber=1.0),
+    # Whole distributions cost more an update and need fewer.
+    ("c51", "CartPole-v1"): {
+        **_dqn_cartpole(outputs={"class": "c51", "least": 0.0, "most": 100.0}, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
+    },
+    ("qr_dqn", "CartPole-v1"): {
+        **_dqn_cartpole(outputs={"class": "quantiles", "count": 32}, huber=1.0, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
+    },
     ("target_q", "CartPole-v1"): _dqn_cartpole(),
     ("q_replay", "CartPole-v1"): _dqn_cartpole(target_period=1),
     ("retrace_q", "CartPole-v1"): {
-        **_dqn_cartpole(n_step=1, traces="retrace", trace_decay=0.9),
-        "loop": {"unroll": 4, "updates": 4, "batch_size": 32, "length": 8},
+        **_dqn_cartpole(n_step=1, traces="retrace", trace_decay=0.9, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 16, "length": 8},
     },
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
