@@ -300,6 +300,7 @@ ENVIRONMENTS: dict[str, str] = {
     "OneStep": "probe: one step, reward 1; V = 1",
     "TruncatedLoop": "probe: reward 1 for ever, cut after 10 steps; V = 1/(1 - gamma)",
     "RecallProbe": "probe: repeat a cue shown at the start; needs a memory",
+    "Catch": "pictures of 10 x 5 pixels: catch a falling ball; the optimum is 1",
 }
 """Environments that are compiled with the learner. Every Gymnasium id works besides, through one door."""
 

@@ -9,6 +9,30 @@ Preset = dict[str, Any]
 
 _PPO = {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_grad_norm": 5.0}
 
+# Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
+_DQN_CARTPOLE: Preset = {
+    "steps": 50_000,
+    "num_envs": 1,
+    "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "length": 8},
+    "learner": {
+        "learning_rate": "linear:1e-3:1e-4",
+        "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
+        "epsilon": "linear:1:0.1:0.12",
+        "n_step": 8,
+        "target_period": 400,
+        "double": True,
+        "huber": 10.0,
+        "max_grad_norm": 100.0,
+    },
+}
+_TANH_64 = {"class": "mlp", "sizes": [64], "activation": "tanh"}
+
+
+def _dqn_cartpole(**learner: Any) -> Preset:
+    """DQN's preset with some of the learner's values replaced."""
+    return {**_DQN_CARTPOLE, "learner": {**_DQN_CARTPOLE["learner"], **learner}}
+
+
 PRESETS: dict[tuple[str, str], Preset] = {
     # Every one was found here; scores over seeds are in docs/results.md.
     ("ppo", "CartPole-v1"): {"steps": 100_000, "num_envs": 8, "loop": {"unroll": 128}, "learner": _PPO},
@@ -46,20 +70,24 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "learner": {**_PPO, "normalise_observations": True},
     },
     # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
-    ("dqn", "CartPole-v1"): {
-        "steps": 50_000,
-        "num_envs": 1,
-        "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "length": 8},
-        "learner": {
-            "learning_rate": "linear:1e-3:1e-4",
-            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
-            "epsilon": "linear:1:0.1:0.12",
-            "n_step": 8,
-            "target_period": 400,
-            "double": True,
-            "huber": 10.0,
-            "max_grad_norm": 100.0,
-        },
+    ("dqn", "CartPole-v1"): _DQN_CARTPOLE,
+    ("double_dqn", "CartPole-v1"): _DQN_CARTPOLE,
+    ("dueling_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64]),
+    ("noisy_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64], epsilon=0.0),
+    # Whole distributions cost more an update and need fewer.
+    ("c51", "CartPole-v1"): {
+        **_dqn_cartpole(outputs={"class": "c51", "least": 0.0, "most": 100.0}, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
+    },
+    ("qr_dqn", "CartPole-v1"): {
+        **_dqn_cartpole(outputs={"class": "quantiles", "count": 32}, huber=1.0, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
+    },
+    ("target_q", "CartPole-v1"): _dqn_cartpole(),
+    ("q_replay", "CartPole-v1"): _dqn_cartpole(target_period=1),
+    ("retrace_q", "CartPole-v1"): {
+        **_dqn_cartpole(n_step=1, traces="retrace", trace_decay=0.9, target_period=200),
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 16, "length": 8},
     },
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {

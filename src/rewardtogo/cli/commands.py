@@ -192,6 +192,7 @@ def _eval(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
         stochastic=given.stochastic,
         seed=given.seed,
         learner=_learner_for(given.run, given.learner_class),
+        values=given.values,
     )
     if given.json:
         print(json.dumps(found))
@@ -201,6 +202,11 @@ def _eval(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
         f"return {found['return_mean']:.2f} [{low:.2f}, {high:.2f}] (sd {found['return_std']:.2f}) over {found['episodes']} episodes "
         f"of {found['length_mean']:.1f} steps"
     )
+    if given.values:
+        shown = lambda x: "unknown" if x is None else f"{x:.2f}"  # noqa: E731
+        print(
+            f"value {shown(found['value_estimated'])} estimated, {shown(found['value_true'])} true, over {found['value_states']} states"
+        )
 
 
 def _play(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:

@@ -150,6 +150,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     p.add_argument("--checkpoint", default="last", metavar="best|last|N")
     p.add_argument("--stochastic", action="store_true", help="sample actions")
+    p.add_argument("--values", action="store_true", help="compare estimated values with true ones")
     p.add_argument("--seed", type=_seed, default=0)
     p.add_argument("--learner-class", metavar="MODULE:CLASS")
     p.add_argument("--json", action="store_true")

@@ -9,6 +9,7 @@ from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
 from .cartpole import CartPole
+from .catch import Catch
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
@@ -33,6 +34,7 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
+    "Catch": Catch,
 }
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 

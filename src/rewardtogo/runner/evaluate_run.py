@@ -12,12 +12,17 @@ from ..data.files import Damaged
 from ..envs.gymnasium import GymnasiumEnv, hosted
 from ..envs.registry import BACKENDS, COMPILED, make
 from ..envs.vectorize import Vectorized, vectorize
+from ..value.overestimation import check_values
+from .config import as_builtin
 from .engine import Program
 from .evaluate import Evaluator, lanes_for, summary
 from .folder import RunFolder
 from .plan import Plan, check_budget, from_config
 from .policy import load
 from .train import RunState
+
+VALUE_STEPS = 20_000
+"""Steps played to compare values with returns."""
 
 
 def evaluate_run(
@@ -29,6 +34,7 @@ def evaluate_run(
     stochastic: bool = False,
     seed: int = 0,
     learner: Learner | None = None,
+    values: bool = False,
 ) -> dict[str, Any]:
     """Play exactly `episodes` whole episodes with a run's policy; what `rtg eval --json` prints.
 
@@ -36,6 +42,8 @@ def evaluate_run(
     - `checkpoint`: `"last"`, `"best"`, or the number of an iteration of which `checkpoints/` has the whole state.
     - `stochastic`: sample actions as in training.
     - `learner`: needed for a run of a learner that is not part of the library.
+    - `values`: compare what the policy thinks that states are worth with what it then earns, discounted as in training
+      (`value.overestimation`): `value_estimated`, `value_true`, and how many states were compared, `value_states`.
 
     Raises `ValueError`, one sentence, where the run, the checkpoint or the environment cannot be used.
     """
@@ -48,12 +56,27 @@ def evaluate_run(
     try:
         require_same_spaces(spec, vector_env)
         returns, lengths = Evaluator(vector_env, episodes)(policy, jax.random.key(seed))
+        thoughts = _values(folder, policy, vector_env, seed) if values else {}
     finally:
         if env is None or isinstance(env, str):
             for host in hosted(vector_env):
                 host.close()
     # Where the environments do not divide the episodes, the last round is too long; dropping by place favours no length.
-    return summary(returns[:episodes], lengths[:episodes])
+    return summary(returns[:episodes], lengths[:episodes]) | thoughts
+
+
+def _values(folder: RunFolder, policy: Policy, env: VectorEnv, seed: int) -> dict[str, Any]:
+    """Mean estimated and true values of the states of `VALUE_STEPS` steps; None where no state's value became known."""
+    gamma = folder.config()["learner"].get("gamma")
+    if not isinstance(gamma, (int, float)):
+        raise ValueError(
+            f"{folder.path} was trained without one fixed discount, so its values have no meaning to check: leave --values out"
+        )
+    steps = -(-VALUE_STEPS // env.num_envs)
+    check = jax.jit(lambda policy, key: check_values(env, policy, key, gamma=gamma, steps=steps))
+    found = jax.device_get(check(policy, jax.random.key(seed)))
+    means = {"value_estimated": found.estimated, "value_true": found.true}
+    return as_builtin(means) | {"value_states": int(found.states)}
 
 
 def policy_of(
