@@ -202,6 +202,7 @@ ENVIRONMENTS: dict[str, str] = {
     "MountainCarContinuous-v0": "twin of Gymnasium's, continuous actions",
     "Pendulum-v1": "twin of Gymnasium's: swing up a pendulum",
     "PendulumNoVel-v1": "Pendulum without the angular velocity: needs a memory",
+    "Catch": "a ball falls, a paddle catches it: the smallest game of pictures, 8 bits",
     "OneStep": "probe: one step, reward 1; V = 1",
     "TruncatedLoop": "probe: reward 1 for ever, cut after 10 steps; V = 1/(1 - gamma)",
     "RecallProbe": "probe: repeat a cue shown at the start; needs a memory",

@@ -61,6 +61,32 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "max_grad_norm": 100.0,
         },
     },
+    ("per_dqn", "CartPole-v1"): {
+        "steps": 50_000,
+        "num_envs": 1,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "length": 8},
+        "learner": {
+            "learning_rate": "linear:1e-3:1e-4",
+            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
+            "epsilon": "linear:1:0.1:0.12",
+            "n_step": 8,
+            "target_period": 400,
+            "double": True,
+            "huber": 10.0,
+            "max_grad_norm": 100.0,
+        },
+    },
+    ("dqn", "Catch"): {
+        "steps": 20_000,
+        "num_envs": 8,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 32, "warm_up": 1000, "replay": {"capacity": 10_000}},
+        "learner": {
+            "learning_rate": 1e-3,
+            "network": {"class": "cnn", "channels": [8, 8], "kernels": [3, 3], "strides": [1, 1], "sizes": [64]},
+            "target_period": 100,
+            "double": True,
+        },
+    },
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,

@@ -9,6 +9,7 @@ from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
 from .cartpole import CartPole
+from .catch import Catch
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
@@ -29,6 +30,7 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "MountainCarContinuous-v0": lambda: TimeLimit(MountainCarContinuous(), 999),
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
+    "Catch": Catch,
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
