@@ -8,6 +8,7 @@ import gymnasium
 from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
+from .atari import PREFIX, RAW_REWARD, Atari
 from .cartpole import CartPole
 from .catch import Catch
 from .envpool import EnvPool
@@ -78,6 +79,8 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
         raise ValueError(f"there must be at least one environment, not {num_envs}")
     if backend == "envpool":
         return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
+    if name.startswith(PREFIX) and backend != "jax":
+        return GymnasiumEnv(Atari(name, num_envs, kwargs), extras=(RAW_REWARD,))
     if name in COMPILED and backend != "gymnasium" and not kwargs:
         return vectorize(COMPILED[name](), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
