@@ -2,6 +2,7 @@
 
 from .acrobot import Acrobot as Acrobot
 from .cartpole import CartPole as CartPole
+from .catch import Catch as Catch
 from .check import check_env as check_env
 from .gymnasium import EnvironmentFailure as EnvironmentFailure
 from .gymnasium import GymnasiumEnv as GymnasiumEnv

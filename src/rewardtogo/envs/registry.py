@@ -8,6 +8,7 @@ import gymnasium
 from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
+from .atari import PREFIX, RAW_REWARD, Atari
 from .cartpole import CartPole
 from .catch import Catch
 from .envpool import EnvPool
@@ -31,10 +32,10 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "MountainCarContinuous-v0": lambda: TimeLimit(MountainCarContinuous(), 999),
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
+    "Catch": Catch,
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
-    "Catch": Catch,
 }
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 
@@ -94,6 +95,8 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
         raise ValueError(f"there must be at least one environment, not {num_envs}")
     if backend == "envpool":
         return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
+    if name.startswith(PREFIX) and backend != "jax":
+        return GymnasiumEnv(Atari(name, num_envs, kwargs), extras=(RAW_REWARD,))
     if name in COMPILED and backend != "gymnasium" and not kwargs:
         return vectorize(COMPILED[name](), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
