@@ -19,10 +19,13 @@ from ..core import Schedule
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
 
 Module = TypeVar("Module")
 
-PARTS: dict[str, type] = {c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay)}
+PARTS: dict[str, type] = {
+    c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay, EpsilonGreedy, Boltzmann, Greedy)
+}
 
 
 KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a name"}
