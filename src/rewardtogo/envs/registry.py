@@ -15,13 +15,14 @@ from .mountain_car import MountainCar, MountainCarContinuous
 from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .time_limit import TimeLimit
+from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
 from .wrappers import MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 
-COMPILED: dict[str, Callable[[], Environment]] = {
+COMPILED: dict[str, Callable[..., Environment]] = {
     "CartPole-v1": lambda: TimeLimit(CartPole(), 500),
     "CartPoleNoVel-v1": lambda: TimeLimit(MaskObservation(CartPole(), keep=(0, 2)), 500),
     "Acrobot-v1": lambda: TimeLimit(Acrobot(), 500),
@@ -32,6 +33,8 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
+    # The default argument holds the name: a loop's variable would be the last one in all of them.
+    **{name: (lambda name=name, **kwargs: toy_text(name, **kwargs)) for name in TABULAR},
 }
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 
@@ -44,7 +47,8 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
     - `num_envs`: B, 1 if not given.
     - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"envpool"` for EnvPool's (extra
       `envpool`), `"auto"` for the twin where there is one, else Gymnasium's.
-    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own.
+    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own, but for the toy environments,
+      whose twins are made from their tables.
 
     Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
     """
@@ -76,8 +80,8 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
         raise ValueError(f"there must be at least one environment, not {num_envs}")
     if backend == "envpool":
         return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
-    if name in COMPILED and backend != "gymnasium" and not kwargs:
-        return vectorize(COMPILED[name](), num_envs)
+    if name in COMPILED and backend != "gymnasium" and (not kwargs or has_twin(name, kwargs)):
+        return vectorize(COMPILED[name](**kwargs), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
         raise ValueError(
             f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out"
