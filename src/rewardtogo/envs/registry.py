@@ -18,13 +18,14 @@ from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
 from .time_limit import TimeLimit
+from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
 from .wrappers import MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 
-COMPILED: dict[str, Callable[[], Environment]] = {
+COMPILED: dict[str, Callable[..., Environment]] = {
     "CartPole-v1": lambda: TimeLimit(CartPole(), 500),
     "CartPoleNoVel-v1": lambda: TimeLimit(MaskObservation(CartPole(), keep=(0, 2)), 500),
     "Acrobot-v1": lambda: TimeLimit(Acrobot(), 500),
@@ -36,6 +37,8 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
+    # The default argument holds the name: a loop's variable would be the last one in all of them.
+    **{name: (lambda name=name, **kwargs: toy_text(name, **kwargs)) for name in TABULAR},
 }
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 
@@ -57,7 +60,8 @@ def make(
       `envpool`), `"auto"` for the twin where there is one, else Gymnasium's.
     - `normalise_reward`: a discount in [0, 1]; rewards are then divided by the running standard deviation of the sums that they
       make with it (`NormalizeReward`). Returns that are reported stay the environment's own.
-    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own.
+    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own, but for the toy environments,
+      whose twins are made from their tables.
 
     Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
     """
@@ -97,8 +101,8 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
         return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
     if name.startswith(PREFIX) and backend != "jax":
         return GymnasiumEnv(Atari(name, num_envs, kwargs), extras=(RAW_REWARD,))
-    if name in COMPILED and backend != "gymnasium" and not kwargs:
-        return vectorize(COMPILED[name](), num_envs)
+    if name in COMPILED and backend != "gymnasium" and (not kwargs or has_twin(name, kwargs)):
+        return vectorize(COMPILED[name](**kwargs), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
         raise ValueError(
             f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out"

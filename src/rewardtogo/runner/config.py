@@ -20,12 +20,27 @@ from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
 from ..value.outputs import C51, Expectation, Quantiles
 
 Module = TypeVar("Module")
 
 PARTS: dict[str, type] = {
-    c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay, PrioritisedReplay, Expectation, C51, Quantiles)
+    c.__name__.lower(): c
+    for c in (
+        MLP,
+        CNN,
+        GRU,
+        LSTM,
+        UniformReplay,
+        PrioritisedReplay,
+        Expectation,
+        C51,
+        Quantiles,
+        EpsilonGreedy,
+        Boltzmann,
+        Greedy,
+    )
 }
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
