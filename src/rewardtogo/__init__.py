@@ -58,7 +58,17 @@ if TYPE_CHECKING:
     from .runner.train import Run as Run
     from .runner.train import resume as resume
     from .runner.train import train as train
+    from .value.cem_q import CEMQ as CEMQ
+    from .value.ddpg import DDPG as DDPG
     from .value.dqn import DQN as DQN
+    from .value.exploration import OU as OU
+    from .value.exploration import Gaussian as Gaussian
+    from .value.maximisers import CEM as CEM
+    from .value.maximisers import Ascent as Ascent
+    from .value.maximisers import Sampled as Sampled
+    from .value.naf import NAF as NAF
+    from .value.sac import SAC as SAC
+    from .value.td3 import TD3 as TD3
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
@@ -83,7 +93,14 @@ _HOMES = {
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
     "runner.train": "Run resume train",
+    "value.cem_q": "CEMQ",
+    "value.ddpg": "DDPG",
     "value.dqn": "DQN",
+    "value.exploration": "Gaussian OU",
+    "value.maximisers": "Ascent CEM Sampled",
+    "value.naf": "NAF",
+    "value.sac": "SAC",
+    "value.td3": "TD3",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (

@@ -19,10 +19,13 @@ from ..core import Schedule
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+from ..value.exploration import OU, Gaussian
+from ..value.maximisers import CEM, Ascent, Sampled
 
 Module = TypeVar("Module")
 
 PARTS: dict[str, type] = {c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay)}
+PARTS |= {c.__name__.lower(): c for c in (Gaussian, OU, Sampled, Ascent, CEM)}
 
 
 KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a name"}
