@@ -96,7 +96,8 @@ class TD3(Learner):
         if self.policy_delay == 1:
             return now._improve(before, sample), metrics, fit.errors
         due = before.updates % self.policy_delay == 0
-        return jax.lax.cond(due, now._improve, lambda s, _: s, before, sample), metrics, fit.errors
+        improve = lambda s: now._improve(s, sample)  # noqa: E731  (a bound method with traced numbers has no hash)
+        return jax.lax.cond(due, improve, lambda s: s, before), metrics, fit.errors
 
     def _improve(self, state: DeterministicState, sample: Sample) -> DeterministicState:
         """The actor's step, after which all targets move."""
