@@ -60,10 +60,20 @@ if TYPE_CHECKING:
     from .runner.train import Run as Run
     from .runner.train import resume as resume
     from .runner.train import train as train
+    from .value.cem_q import CEMQ as CEMQ
+    from .value.ddpg import DDPG as DDPG
     from .value.dqn import DQN as DQN
+    from .value.maximisers import CEM as CEM
+    from .value.maximisers import Ascent as Ascent
+    from .value.maximisers import Sampled as Sampled
+    from .value.naf import NAF as NAF
+    from .value.noise import OU as OU
+    from .value.noise import Gaussian as Gaussian
     from .value.outputs import C51 as C51
     from .value.outputs import Expectation as Expectation
     from .value.outputs import Quantiles as Quantiles
+    from .value.sac import SAC as SAC
+    from .value.td3 import TD3 as TD3
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
@@ -89,8 +99,15 @@ _HOMES = {
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
     "runner.train": "Run resume train",
+    "value.cem_q": "CEMQ",
+    "value.ddpg": "DDPG",
     "value.dqn": "DQN",
+    "value.maximisers": "Ascent CEM Sampled",
+    "value.naf": "NAF",
+    "value.noise": "Gaussian OU",
     "value.outputs": "C51 Expectation Quantiles",
+    "value.sac": "SAC",
+    "value.td3": "TD3",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (

@@ -29,6 +29,7 @@ ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 _VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
 _DQN = "rewardtogo.value.dqn:DQN"
 _ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
+_EVERY_STEP = {"unroll": 1, "batch_size": 256, "replay": {"capacity": 1_000_000}}
 
 ALGORITHMS: dict[str, Row] = {
     row.name: row
@@ -278,6 +279,61 @@ ALGORITHMS: dict[str, Row] = {
             "deep Q-learning that replays steps with large errors more often",
             {},
             {"replay": {"class": "prioritised"}},
+        ),
+        Row(
+            "cem_q",
+            "rewardtogo.value.cem_q:CEMQ",
+            "off_policy",
+            "6",
+            "6.3.3",
+            ("box",),
+            "Q-learning with continuous actions: the best one is searched for, by samples, ascent or cross-entropy",
+            {},
+            _EVERY_STEP,
+        ),
+        Row(
+            "naf",
+            "rewardtogo.value.naf:NAF",
+            "off_policy",
+            "6",
+            "6.3.3",
+            ("box",),
+            "normalised advantage functions: a Q that is quadratic in the action, so that its maximum is known",
+            {},
+            _EVERY_STEP,
+        ),
+        Row(
+            "ddpg",
+            "rewardtogo.value.ddpg:DDPG",
+            "off_policy",
+            "6",
+            "Alg 14",
+            ("box",),
+            "deep deterministic policy gradient: deep Q-learning with a learned argmax",
+            {},
+            _EVERY_STEP,
+        ),
+        Row(
+            "td3",
+            "rewardtogo.value.td3:TD3",
+            "off_policy",
+            "6",
+            "6.28",
+            ("box",),
+            "DDPG with two critics, smoothed targets and a delayed actor",
+            {},
+            _EVERY_STEP,
+        ),
+        Row(
+            "sac",
+            "rewardtogo.value.sac:SAC",
+            "off_policy",
+            "6",
+            "6.28",
+            ("box",),
+            "soft actor-critic: two critics, a squashed Gaussian and a learned temperature",
+            {},
+            _EVERY_STEP,
         ),
     )
 }

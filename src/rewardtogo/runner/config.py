@@ -21,27 +21,16 @@ from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
 from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
+from ..value.maximisers import CEM, Ascent, Sampled
+from ..value.noise import OU, Gaussian
 from ..value.outputs import C51, Expectation, Quantiles
 
 Module = TypeVar("Module")
 
-PARTS: dict[str, type] = {
-    c.__name__.lower(): c
-    for c in (
-        MLP,
-        CNN,
-        GRU,
-        LSTM,
-        UniformReplay,
-        PrioritisedReplay,
-        Expectation,
-        C51,
-        Quantiles,
-        EpsilonGreedy,
-        Boltzmann,
-        Greedy,
-    )
-}
+_NETWORKS = (MLP, CNN, GRU, LSTM)
+_MEMORIES = (UniformReplay, PrioritisedReplay)
+_CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
+PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_MEMORIES, *_CHOICES)}
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 
