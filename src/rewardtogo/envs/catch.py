@@ -2,7 +2,8 @@
 
 The board is `rows` x `columns` grey pixels, ball and paddle white. Each step the ball falls a row, and the paddle moves left (0), stays
 (1) or moves right (2). When the ball reaches the last row the episode ends, with reward 1 if the paddle is there and -1 if not. The
-optimum is 1: from anywhere in the middle there is time."""
+optimum is 1: from anywhere in the middle there is time.
+"""
 
 import equinox as eqx
 import gymnasium.spaces as spaces
