@@ -65,7 +65,7 @@ class OffPolicy(Algorithm, Configured):
                 f"a replay of {self.replay.size} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
                 f"environments: give it a capacity of at least {self._block}"
             )
-        if self.replay.size < self.batch_size:
+        if self.replay.size < self.batch_size < 2**31:
             raise ValueError(
                 f"a replay of {self.replay.size} transitions is smaller than a batch of {self.batch_size}, which would hold most of "
                 f"them twice: give it a capacity of at least {self.batch_size}, or a smaller batch_size"

@@ -100,6 +100,8 @@ class DQN(Learner):
         return self.correction == "importance" or self.traces in ("retrace", "importance")
 
     def __check_init__(self) -> None:
+        if any(size < 1 for size in self.head_sizes):
+            raise ValueError(f"DQN.head_sizes must be whole numbers of at least 1, not {self.head_sizes}")
         if self.traces != "none" and self.n_step > 1:
             raise ValueError(
                 f"traces={self.traces!r} uses whole sequences, and n_step={self.n_step} pieces of them: use one or the other"
