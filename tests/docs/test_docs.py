@@ -138,6 +138,9 @@ def test_command_is_one(page, line, monkeypatch):
         assert class_of(words[0])
         return
     given, rest = TABLE[command].parse_known_args(words)
+    if command == "solve":
+        assert set(_nested(rest, ("env",), "solve")) == {"env"}
+        return
     if command != "train":
         assert not rest
         return

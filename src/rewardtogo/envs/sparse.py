@@ -50,7 +50,7 @@ class SparseMDP(eqx.Module):
         probabilities: Table,
         rewards: Table,
         initial: Table | int = 0,
-        discount: float | np.floating | np.ndarray = 1.0,
+        discount: float | np.floating | Array | np.ndarray = 1.0,
         terminal: Table | None = None,
         ends: Table | None = None,
     ) -> None:
@@ -120,14 +120,10 @@ class SparseMDP(eqx.Module):
     def can_end(self) -> Bool[np.ndarray, "S"]:
         """From which states a path of positive probability leads to an end: breadth first, backwards."""
         found = self.terminal | ((self.probabilities > 0) & self.ends).any((1, 2))
-        offsets, sources = self.predecessors()
-        front = np.flatnonzero(found)
+        lists, front = self.predecessors(), np.flatnonzero(found)
         while len(front):
-            counts = offsets[front + 1] - offsets[front]
-            # The positions of all predecessors of the front, as one range with jumps.
-            jumps = np.repeat(offsets[front] - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
-            reached = sources[jumps + np.arange(counts.sum())]
-            front = np.unique(reached[~found[reached]])
+            reached = before(lists, front)
+            front = reached[~found[reached]]
             found[front] = True
         return found
 
@@ -157,12 +153,23 @@ class SparseMDP(eqx.Module):
         np.add.at(transitions, (s, a, where), self.probabilities)
         transitions[states:, :, -1] = 1.0
         pad = lambda x: np.concatenate([x, np.zeros((size - states, *x.shape[1:]), x.dtype)])  # noqa: E731
-        terminal = pad(self.terminal) | (np.arange(size) >= states)
+        terminal = np.logical_or(pad(self.terminal), np.arange(size) >= states)
         return MDP(transitions, pad(self.rewards), pad(self.initial), self.discount, terminal)
 
 
 MOST_BYTES = 4e9
 """The largest matrices that are made without being asked for them by name."""
+
+
+def before(
+    lists: tuple[Int[np.ndarray, "S1"], Int[np.ndarray, "N"]], states: Int[np.ndarray, "M"]
+) -> Int[np.ndarray, "L"]:
+    """The predecessors of some states, from the lists of `SparseMDP.predecessors`, each once."""
+    offsets, sources = lists
+    counts = offsets[states + 1] - offsets[states]
+    # The positions of all of them, as one range with jumps.
+    jumps = np.repeat(offsets[states] - np.concatenate([[0], np.cumsum(counts)[:-1]]), counts)
+    return np.unique(sources[jumps + np.arange(counts.sum())])
 
 
 def _states(successors: Table) -> Int[np.ndarray, "S A K"]:

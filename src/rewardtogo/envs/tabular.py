@@ -171,7 +171,10 @@ def initial_distribution(initial: Table | int, terminal: np.ndarray) -> np.ndarr
     if isinstance(initial, (int, np.integer)):
         if not 0 <= initial < states:
             raise ValueError(f"initial is state {initial} and there are {states}: give a state from 0 to {states - 1}")
-    start = np.eye(states)[initial] if isinstance(initial, (int, np.integer)) else as_floats(initial)
+        start = np.zeros(states)
+        start[initial] = 1.0
+    else:
+        start = as_floats(initial)
     if start.shape != (states,):
         raise ValueError(f"initial has shape {start.shape} for {states} states: give one probability for each state")
     check_distributions("initial", start)

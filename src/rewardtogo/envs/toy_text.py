@@ -12,6 +12,7 @@ import inspect
 from typing import Any
 
 import gymnasium
+import gymnasium.envs.registration as registration
 import numpy as np
 from jaxtyping import Int8
 
@@ -53,7 +54,7 @@ def gymnasium_table(name: str, **kwargs: Any) -> gymnasium.Env:
 
 def _arguments(name: str) -> list[str]:
     entry = gymnasium.registry[name].entry_point if name in gymnasium.registry else None
-    cls = gymnasium.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
+    cls = registration.load_env_creator(entry) if isinstance(entry, str) else entry
     return [] if cls is None else [p for p in inspect.signature(cls).parameters if p != "render_mode"]
 
 
