@@ -25,6 +25,15 @@ def make_model(library: str, task: str, seed: int):
     else:
         from stable_baselines3 import DQN, PPO
     common = {"seed": seed, "device": "cpu"}
+    if task in ("sac", "td3"):
+        from stable_baselines3 import SAC, TD3
+
+        # TD3 has a delay of 2 by default.
+        model = {"sac": SAC, "td3": TD3}[task](
+            "MlpPolicy", make_vec_env("Pendulum-v1", 1, seed=seed), buffer_size=100_000, batch_size=256, train_freq=1, gradient_steps=1,
+            learning_starts=1000, policy_kwargs={"net_arch": [256, 256]}, **common,
+        )  # fmt: skip
+        return model, 1300
     envs = lambda number: make_vec_env("CartPole-v1", number, seed=seed)  # noqa: E731
     layers = {"net_arch": [64, 64], "activation_fn": activation(library, "relu" if task == "dqn" else "tanh")}
     if task == "ppo":
@@ -66,7 +75,7 @@ def choose_threads(model, steps: int) -> int:
 def main() -> None:
     """Train, measure, evaluate."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=["ppo", "dqn", "zoo"])
+    parser.add_argument("task", choices=["ppo", "dqn", "zoo", "sac", "td3"])
     parser.add_argument("--library", choices=["sb3", "sbx"], default="sb3")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
