@@ -14,6 +14,7 @@ import rewardtogo as rtg
 from rewardtogo.core import MASK, Algorithm, Environment, Timestep, Transition, env_spec
 from rewardtogo.data import Dataset
 from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
 
@@ -39,6 +40,12 @@ def on_policy(learner: Any, **options: Any) -> Algorithm:
 def off_policy(learner: Any, replay: Any = rtg.UniformReplay(256), **options: Any) -> Algorithm:
     options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
     return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, replay, **options)
+
+
+def continuous(learner: Any, **options: Any) -> Algorithm:
+    """Off-policy with continuous actions: Pendulum, cut after 16 steps."""
+    options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
+    return rtg.OffPolicy(rtg.vectorize(TimeLimit(Pendulum(), 16), NUM_ENVS), learner, rtg.UniformReplay(256), **options)
 
 
 @functools.cache
@@ -100,6 +107,11 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
         rtg.DQN(network=lstm, burn_in=1, n_step=2, double=True, outputs=rtg.Expectation(rescale=True), target_period=2)
     ),
     "dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, double=True, target_period=1, target_rate=0.1)),
+    "cem-q": lambda: continuous(rtg.CEMQ(network=small, maximiser=rtg.CEM(2, 8, 2), normalise_observations=True)),
+    "naf": lambda: continuous(rtg.NAF(network=small, n_step=3)),
+    "ddpg": lambda: continuous(rtg.DDPG(network=small, noise=rtg.OU(), normalise_observations=True)),
+    "td3-lstm": lambda: continuous(rtg.TD3(network=lstm, noise=rtg.OU())),
+    "sac": lambda: continuous(rtg.SAC(network=small, normalise_observations=True)),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),
 }

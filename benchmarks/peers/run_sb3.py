@@ -58,6 +58,15 @@ def make_model(library: str, task: str, seed: int):
         from sbx import DQN, PPO
     else:
         from stable_baselines3 import DQN, PPO
+    if task in ("sac", "td3"):
+        from stable_baselines3 import SAC, TD3
+
+        # TD3 has a delay of 2 by default.
+        model = {"sac": SAC, "td3": TD3}[task](
+            "MlpPolicy", envs(1, "Pendulum-v1"), buffer_size=100_000, batch_size=256, train_freq=1, gradient_steps=1,
+            learning_starts=1000, policy_kwargs={"net_arch": [256, 256]}, **common,
+        )  # fmt: skip
+        return model, 1300
     if task == "ppo":
         model = PPO(
             "MlpPolicy", envs(8), n_steps=128, n_epochs=4, batch_size=256, learning_rate=3e-4, ent_coef=0.0,
@@ -102,7 +111,7 @@ def choose_threads(model, steps: int) -> int:
 def main() -> None:
     """Train, measure, evaluate."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=["ppo", "dqn", "zoo", "a2c", "trpo", "recurrent", "cheetah"])
+    parser.add_argument("task", choices=["ppo", "dqn", "zoo", "a2c", "trpo", "recurrent", "cheetah", "sac", "td3"])
     parser.add_argument("--library", choices=["sb3", "sbx"], default="sb3")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -37,7 +37,7 @@ from ..core import (
 )
 from ..nn import MLP, Network, Optimiser, RunningNorm, as_network
 from .continuous import Memories, Sample, fit_critics, follow, require_short
-from .critics import Critics, from_units, require_box
+from .critics import Critics, from_units, least, require_box
 from .maximisers import CEM, Maximiser, Maximum
 from .noise import Gaussian, Noise, Noisy
 
@@ -78,7 +78,7 @@ class SearchingPolicy(Policy):
 
     def _search(self, carry: Carry, observation: Observation, key: PRNGKey) -> Maximum:
         seen = self.critics.see(carry.critics, observation)
-        return self.maximiser(lambda units: self.critics(seen, units).min(), self.spec.shape, key)
+        return self.maximiser(lambda units: least(self.critics(seen, units)), self.spec.shape, key)
 
 
 class CEMQ(Learner):
@@ -115,7 +115,7 @@ class CEMQ(Learner):
 
     def policy(self, state: CEMQState, explore: bool) -> Policy:
         policy = SearchingPolicy(state.critics, self.maximiser, state.norm, state.spec)
-        return Noisy(policy, self.at(state.updates).noise, state.spec) if explore else policy
+        return Noisy.of(policy, self.at(state.updates).noise, state.spec) if explore else policy
 
     def update(
         self, state: CEMQState, batch: Batch, key: PRNGKey
@@ -137,7 +137,7 @@ class CEMQ(Learner):
         seen = critics.see_along(sample.memory.critics, sample.t)[1]
 
         def search(seen: Observation, key: PRNGKey) -> Maximum:
-            return self.maximiser(lambda units: critics(seen, units).min(), state.spec.shape, key)
+            return self.maximiser(lambda units: least(critics(seen, units)), state.spec.shape, key)
 
         keys = jax.random.split(key, sample.t.reward.shape)
         seen_axis = 0 if critics.each.reader is None else 1

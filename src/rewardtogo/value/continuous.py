@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from ..core import Action, Batch, Carry, EnvSpec, Number, Observation, Policy, PRNGKey, Spec, Transition
 from ..data.n_step import DISCOUNT, n_step_windows
 from ..nn import Network, Optimiser, RunningNorm, global_norm
-from .critics import Actor, Critics, from_units, over, to_units
+from .critics import Actor, Critics, from_units, least, over, to_units
 from .noise import NoisyMemory
 
 Parameters = TypeVar("Parameters")
@@ -195,5 +195,5 @@ class GreedyActor(Policy):
     def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
         observation = observation if self.norm is None else self.norm(observation)
         units = deterministic(self.actor(carry.actor, observation)[1], 0)
-        value = self.critics(self.critics.see(carry.critics, observation), units).min()
+        value = least(self.critics(self.critics.see(carry.critics, observation), units))
         return {"value": value, "mean": from_units(self.spec, units)}

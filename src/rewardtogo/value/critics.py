@@ -10,6 +10,7 @@ Source: notes 6.3.3; Lillicrap et al. 2016; Fujimoto et al. 2018 (two critics).
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -208,6 +209,15 @@ class Critics(eqx.Module):
     def first(self) -> "Critics":
         """The first of them, by itself."""
         return Critics(jax.tree.map(lambda x: x[:1], self.each), 1, self.shape)
+
+
+def least(q: Float[Array, "E *N"]) -> Float[Array, "*N"]:
+    """The least of E values, place by place.
+
+    By `where`: the derivative of `min` compares the values with their minimum and divides by how many are equal, which is none where the
+    compiler has computed a value twice and rounded it differently.
+    """
+    return functools.reduce(lambda a, b: jnp.where(a < b, a, b), list(q))
 
 
 class Actor(eqx.Module):

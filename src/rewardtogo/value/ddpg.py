@@ -66,7 +66,7 @@ class DDPG(Learner):
 
     def policy(self, state: DeterministicState, explore: bool) -> Policy:
         policy = GreedyActor(state.actor, state.critics, state.norm, state.spec)
-        return Noisy(policy, self.at(state.updates).noise, state.spec) if explore else policy
+        return Noisy.of(policy, self.at(state.updates).noise, state.spec) if explore else policy
 
     def update(
         self, state: DeterministicState, batch: Batch, key: PRNGKey

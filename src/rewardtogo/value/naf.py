@@ -165,7 +165,7 @@ class NAF(Learner):
 
     def policy(self, state: NAFState, explore: bool) -> Policy:
         policy = QuadraticPolicy(state.network, state.norm, state.spec)
-        return Noisy(policy, self.at(state.updates).noise, state.spec) if explore else policy
+        return Noisy.of(policy, self.at(state.updates).noise, state.spec) if explore else policy
 
     def update(
         self, state: NAFState, batch: Batch, key: PRNGKey

@@ -95,6 +95,11 @@ class Noisy(Policy):
     noise: Noise
     spec: Spec = eqx.field(static=True)
 
+    @staticmethod
+    def of(policy: Policy, noise: Noise, spec: Spec) -> "Noisy":
+        """The same, the noise's numbers as arrays, so that a policy's file has one type for them."""
+        return Noisy(policy, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), noise), spec)
+
     def init(self, key: PRNGKey) -> Carry:
         return NoisyMemory(self.policy.init(key), self.noise.init(self.spec.shape))
 

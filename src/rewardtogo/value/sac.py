@@ -40,7 +40,7 @@ from ..core import (
 from ..nn import MLP, Network, Optimiser, RunningNorm, as_network
 from ..ops.distributions import TanhGaussian
 from .continuous import Memories, Sample, fit_critics, follow, require_short
-from .critics import Actor, Critics, from_units, over, require_box
+from .critics import Actor, Critics, from_units, least, over, require_box
 
 LEAST_LOG_STD, MOST_LOG_STD = -10.0, 2.0
 """The logarithm of the standard deviation, before squashing, is clipped to these."""
@@ -92,7 +92,7 @@ class SquashedPolicy(Policy):
     def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
         observation = observation if self.norm is None else self.norm(observation)
         law = law_of(self.actor(carry.actor, observation)[1])
-        value = self.critics(self.critics.see(carry.critics, observation), law.mode()).min()
+        value = least(self.critics(self.critics.see(carry.critics, observation), law.mode()))
         return {
             "value": value,
             "mean": from_units(self.spec, law.mode()),
@@ -156,7 +156,7 @@ class SAC(Learner):
         alpha = learned if self.learn_temperature else jnp.asarray(now.temperature, jnp.float32)
         following, log_prob = draw(state.actor.along(sample.memory.actor, sample.t)[1], sample.axes, target_key)
         seen = state.target_critics.see_along(sample.memory.critics, sample.t)[1]
-        soft = state.target_critics(seen, following).min(0) - alpha * log_prob
+        soft = least(state.target_critics(seen, following)) - alpha * log_prob
         y = sample.t.reward + sample.discount * soft
         fit = fit_critics(state.critics, state.critic_optimiser, now._rule(now.learning_rate), sample, y)
         actor, actor_optimiser, found = now._improve(state, fit.critics, sample, alpha, actor_key)
@@ -188,7 +188,7 @@ class SAC(Learner):
 
         def loss(actor: Actor) -> tuple[Array, Array]:
             units, log_prob = draw(actor.along(sample.memory.actor, sample.t)[0], sample.axes, key)
-            return (alpha * log_prob - critics(seen, units).min(0)).mean(), -log_prob.mean()
+            return (alpha * log_prob - least(critics(seen, units))).mean(), -log_prob.mean()
 
         (value, entropy), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         rule = self._rule(self.actor_learning_rate)

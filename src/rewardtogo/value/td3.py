@@ -29,7 +29,7 @@ from .continuous import (
     improve_actor,
     require_short,
 )
-from .critics import require_box
+from .critics import least, require_box
 from .noise import Gaussian, Noise, Noisy
 
 
@@ -67,7 +67,7 @@ class TD3(Learner):
 
     def policy(self, state: DeterministicState, explore: bool) -> Policy:
         policy = GreedyActor(state.actor, state.critics, state.norm, state.spec)
-        return Noisy(policy, self.at(state.updates).noise, state.spec) if explore else policy
+        return Noisy.of(policy, self.at(state.updates).noise, state.spec) if explore else policy
 
     def update(
         self, state: DeterministicState, batch: Batch, key: PRNGKey
@@ -79,7 +79,7 @@ class TD3(Learner):
         noise = now.smoothing * jax.random.normal(key, chosen.shape)
         smoothed = jnp.clip(chosen + jnp.clip(noise, -now.smoothing_limit, now.smoothing_limit), -1.0, 1.0)
         seen = state.target_critics.see_along(sample.memory.critics, sample.t)[1]
-        y = sample.t.reward + sample.discount * state.target_critics(seen, smoothed).min(0)
+        y = sample.t.reward + sample.discount * least(state.target_critics(seen, smoothed))
         fit = fit_critics(state.critics, state.critic_optimiser, now._rule(now.learning_rate), sample, y)
         before = DeterministicState(
             state.actor,
