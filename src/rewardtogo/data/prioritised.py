@@ -67,7 +67,8 @@ class PrioritisedReplay(Replay):
         num_envs = example.reward.shape[1]
         rows = ring.rows_of(self.capacity, unroll, num_envs)
         order = Priorities(sum_tree.zeros(rows * num_envs), jnp.ones(()), jnp.zeros((), jnp.int32), length)
-        return ReplayState(ring.empty(example, rows, unroll, self.frames), *jnp.zeros((2,), jnp.int32), order)
+        zero = jnp.zeros((), jnp.int32)
+        return ReplayState(ring.empty(example, rows, unroll, self.frames), zero, zero, order)
 
     def add(self, state: ReplayState, block: Transition) -> ReplayState:
         """A place gets the largest priority when a whole sequence can begin there, and 0 when what was there is overwritten."""

@@ -95,7 +95,7 @@ class Atari(vector.VectorEnv):
         self.spec = gymnasium.spec(name)
         said = self.spec.kwargs
         sticky = given["repeat_action_probability"]
-        self._games = package.AtariVectorEnv(
+        self._games: Any = package.AtariVectorEnv(
             said["game"],
             num_envs,
             autoreset_mode=vector.AutoresetMode.SAME_STEP,

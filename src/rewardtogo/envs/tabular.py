@@ -159,7 +159,7 @@ class MDP(eqx.Module):
         return self.transitions * (1 - self.terminal.astype(self.transitions.dtype))[None, None]
 
 
-def check_discount(discount: np.ndarray) -> None:
+def check_discount(discount: np.ndarray | Array) -> None:
     """Raise `ValueError` unless it is one number in [0, 1]."""
     if discount.ndim or not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount} and must be one number in [0, 1]")

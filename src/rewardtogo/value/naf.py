@@ -77,7 +77,8 @@ class NAFNetwork(eqx.Module):
         ]
         low, high = spec.action.bounds()
         bounded = tuple(bool(b) for b in (np.isfinite(low) & np.isfinite(high)).ravel())
-        return NAFNetwork(torso, *heads, bounded)
+        value, mean, factor = heads
+        return NAFNetwork(torso, value, mean, factor, bounded)
 
     def read(self, features: Float[Array, "F"]) -> Quadratic:
         """Q(s, .) from the torso's features."""
