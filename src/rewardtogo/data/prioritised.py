@@ -24,8 +24,8 @@ from jaxtyping import Array, Float, Int
 
 from ..core import Batch, Number, PRNGKey, Transition, number, setting
 from ..ops.schedules import Linear
-from . import ring, sum_tree
-from .replay import Replay, ReplayState, advance, read, read_sequences
+from . import sum_tree
+from .replay import Replay, ReplayState, advance, begin, read, read_sequences
 
 
 class Priorities(eqx.Module):
@@ -64,11 +64,10 @@ class PrioritisedReplay(Replay):
         return True
 
     def init(self, example: Transition, unroll: int, length: int = 1) -> ReplayState:
-        num_envs = example.reward.shape[1]
-        rows = ring.rows_of(self.capacity, unroll, num_envs)
-        order = Priorities(sum_tree.zeros(rows * num_envs), jnp.ones(()), jnp.zeros((), jnp.int32), length)
-        zero = jnp.zeros((), jnp.int32)
-        return ReplayState(ring.empty(example, rows, unroll, self.frames), zero, zero, order)
+        state = begin(example, self.capacity, unroll, self.frames)
+        tree = sum_tree.zeros(state.storage.reward.size)
+        order = Priorities(tree, jnp.ones(()), jnp.zeros((), jnp.int32), length)
+        return dataclasses.replace(state, order=order)
 
     def add(self, state: ReplayState, block: Transition) -> ReplayState:
         """A place gets the largest priority when a whole sequence can begin there, and 0 when what was there is overwritten."""

@@ -87,8 +87,7 @@ class UniformReplay(Replay):
 
     def init(self, example: Transition, unroll: int, length: int = 1) -> ReplayState:
         del length
-        rows = ring.rows_of(self.capacity, unroll, example.reward.shape[1])
-        return ReplayState(ring.empty(example, rows, unroll, self.frames), *jnp.zeros((2,), jnp.int32))
+        return begin(example, self.capacity, unroll, self.frames)
 
     def add(self, state: ReplayState, block: Transition) -> ReplayState:
         return advance(state, block)
@@ -109,6 +108,13 @@ class UniformReplay(Replay):
     def feedback(self, state: ReplayState, batch: Batch, priorities: Any) -> ReplayState:
         del batch, priorities
         return state
+
+
+def begin(example: Transition, capacity: int, unroll: int, frames: int) -> ReplayState:
+    """Nothing remembered yet, and nothing that drawing depends on."""
+    rows = ring.rows_of(capacity, unroll, example.reward.shape[1])
+    storage = ring.empty(example, rows, unroll, frames)
+    return ReplayState(storage, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
 def advance(state: ReplayState, block: Transition) -> ReplayState:

@@ -111,8 +111,11 @@ class Atari(vector.VectorEnv):
             num_threads=given["num_threads"],
             reward_clipping=False,
         )
-        self.num_envs, self._clip, self._by_life = num_envs, given["clip_rewards"], given["episodic_life"]
-        shape = (given["size"], given["size"], given["stack"])
+        self.num_envs, self._stack = num_envs, given["stack"]
+        self._clip, self._by_life = given["clip_rewards"], given["episodic_life"]
+        # How many pictures of its stack each copy may see: what is older is of the life before.
+        self._lives, self._seen = np.zeros(num_envs), np.full(num_envs, given["stack"])
+        shape: tuple[int, ...] = (given["size"], given["size"], given["stack"])
         self.single_observation_space = spaces.Box(0, 255, shape, np.uint8)
         self.single_action_space = self._games.single_action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -127,15 +130,14 @@ class Atari(vector.VectorEnv):
         seeds = None if seed is None else seed if isinstance(seed, int) else np.asarray(seed)
         pictures, info = self._games.reset(seed=seeds)
         self._lives = np.array(info["lives"])
-        # How many pictures of its stack each copy may see: what is older is of the life before.
-        self._seen = np.full(self.num_envs, self.single_observation_space.shape[-1])
+        self._seen = np.full(self.num_envs, self._stack)
         return self._turned(pictures), {RAW_REWARD: np.zeros(self.num_envs)}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of all copies; where an episode ends, the observation is already the next one's first."""
         pictures, reward, terminated, truncated, said = self._games.step(np.asarray(actions, np.int32))
         over, raw = terminated | truncated, np.array(reward, np.float64)
-        self._seen = np.where(over, self.single_observation_space.shape[-1], self._seen + 1)
+        self._seen = np.where(over, self._stack, self._seen + 1)
         observation = self._blanked(self._turned(pictures))
         final, lives = observation, np.array(said["lives"])
         if over.any():
