@@ -130,7 +130,12 @@ class QNetwork(eqx.Module):
 
 def expected(outputs: Outputs, values: Float[Array, "*N A M"], observation: Observation) -> Float[Array, "*N A"]:
     """Q of every action; masked ones get `FORBIDDEN`."""
-    q, mask = outputs.mean(values), action_mask(observation)
+    return allowed_only(outputs.mean(values), observation)
+
+
+def allowed_only(q: Float[Array, "*N A"], observation: Observation) -> Float[Array, "*N A"]:
+    """The same numbers, `FORBIDDEN` where the observation's mask forbids the action."""
+    mask = action_mask(observation)
     return q if mask is None else jnp.where(mask > 0, q, FORBIDDEN)
 
 

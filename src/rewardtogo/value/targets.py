@@ -23,7 +23,7 @@ from ..core import Number, Observation, Transition
 from ..data.n_step import DISCOUNT
 from ..ops.retrace import Trace, retrace, trace_coefficients
 from .outputs import Outputs
-from .q_network import QNetwork, expected, greedy_probabilities, over
+from .q_network import QNetwork, allowed_only, expected, greedy_probabilities, over
 
 Correction = Literal["none", "adaptive", "importance"]
 CORRECTIONS = ("none", "adaptive", "importance")
@@ -94,8 +94,13 @@ def bootstrapped(outputs: Outputs, t: Transition, gamma: Number, double: bool) -
     """
     ahead = t.next_observation
     discount = t.extras.get(DISCOUNT, gamma * (1.0 - t.terminated))
-    best = jnp.argmax(expected(outputs, ahead.online if double else ahead.target, ahead.observation), -1)
-    return over(t.reward.ndim, outputs.target)(t.reward, discount, outputs_at(ahead.target, best))
+    if outputs.size == 1 and not double:
+        # A single output grows with its expectation: the best action's is the greatest, and need not be looked up.
+        following = allowed_only(ahead.target[..., 0], ahead.observation).max(-1, keepdims=True)
+    else:
+        chooser = expected(outputs, ahead.online if double else ahead.target, ahead.observation)
+        following = outputs_at(ahead.target, jnp.argmax(chooser, -1))
+    return over(t.reward.ndim, outputs.target)(t.reward, discount, following)
 
 
 def traced(
