@@ -16,6 +16,8 @@ from rewardtogo.data import Dataset
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.value.exploration import Boltzmann
+from rewardtogo.value.tabular_q import QLearning
 
 NUM_ENVS = 4
 QUICK = {"xla_backend_optimization_level": 0}
@@ -88,6 +90,10 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2, normalise_observations=True)),
     "dqn-n-step": lambda: off_policy(rtg.DQN(network=small, n_step=3, target_period=2)),
     "dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, double=True, target_period=1, target_rate=0.1)),
+    "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
+    "double-q-learning": lambda: rtg.OnPolicy(
+        rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4
+    ),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),
 }

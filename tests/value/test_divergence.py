@@ -25,7 +25,7 @@ from rewardtogo.value.divergence import (
     semi_gradient,
     w_2w,
 )
-from rewardtogo.value.operators import bellman_backup, sup_norm
+from rewardtogo.value.operators import projection, stepwise, sup_norm
 
 
 def on_policy_chain(seed: int, states: int = 6, features: int = 3, gamma: float = 0.95) -> Chain:
@@ -78,17 +78,17 @@ def test_two_time_scales_converge_where_semi_gradients_do_not(item):
             w = powers(chain, 0.2, method, 1.0, 23)
             check(np.linalg.norm(chain.features @ w), "<", 1e-2, f"{method} on Baird's: ||V|| after 2^23 sweeps")
         rng, worst, rise = np.random.default_rng(0), 0.0, -np.inf
-        for seed in range(50):
+        for seed in range(20):
             mdp = random_mdp(seed, 6, 2, discount=0.9)
             mean = averager(rng.dirichlet(np.ones(3), 6))
             one, other = rng.normal(size=6), rng.normal(size=6)
-            step = lambda v, m=mdp, mean=mean: mean @ bellman_backup(m, v)  # noqa: E731
+            step = lambda v, ahead=stepwise(mdp), mean=mean: mean @ ahead.best(v)  # noqa: E731
             worst = max(worst, sup_norm(step(one) - step(other)) / sup_norm(one - other))
             values = [one]
-            for _ in range(300):
+            for _ in range(200):
                 values.append(step(values[-1]))
             gaps = [sup_norm(v - values[-1]) for v in values[:100]]
-            rise = max(rise, max(b - a for a, b in zip(gaps, gaps[1:], strict=False)))
+            rise = max(rise, float(np.diff(gaps).max()))
         check(worst, "<=", 0.9 + 1e-12, "averagers: sup-norm factor of a fit of a backup, γ = 0.9")
         check(rise, "<=", 1e-12, "averagers: how much the distance to the fixed point ever rises")
     with pytest.raises(ValueError, match="must be in a group"):
@@ -106,16 +106,14 @@ def test_on_policy_it_is_a_contraction(item):
     with item("5.29") as check:
         check(over, "<=", 1e-12, "||γ Π P||_d - γ, 1000 chains with their own stationary d")
         check(off, ">", 1, "E5.10: the largest spectral radius of γ Π P with another d")
-        expected = follow(chain, 1.0, 20_000)[-1]
+        expected = follow(chain, 0.1, 20_000)[-1]
         check(np.abs(expected - lstd(chain)).max(), "<=", 1e-8, "expected semi-gradient TD against LSTD")
         check(
-            np.abs(sampled_td(chain, 400_000) - lstd(chain)).max(), "<=", 1e-2, "sampled TD(0), averaged, against LSTD"
+            np.abs(sampled_td(chain, 200_000) - lstd(chain)).max(), "<=", 1e-2, "sampled TD(0), averaged, against LSTD"
         )
 
 
 def fit_matrix(chain: Chain, weights: np.ndarray) -> np.ndarray:
-    from rewardtogo.value.operators import projection
-
     return projection(chain.features, weights + 1e-9) @ chain.transitions
 
 
@@ -143,8 +141,8 @@ def test_semi_gradients_are_no_gradients(item):
     ]
     skew = [np.abs(j - j.T).max() for j in jacobians]
     fixed = lstd(chain)
-    naive = follow(chain, 0.5, 200_00, "sampled_residual_gradient")[-1]
-    true = follow(chain, 0.5, 200_000, "residual_gradient")[-1]
+    naive = follow(chain, 0.1, 20_000, "sampled_residual_gradient")[-1]
+    true = follow(chain, 0.1, 50_000, "residual_gradient")[-1]
     with item("5.31") as check:
         check(skew[0], ">", 1e-2, "E5.11: asymmetry of the Jacobian of semi-gradient TD, on-policy")
         check(max(skew[1:]), "<=", 1e-8, "asymmetry of residual gradients")

@@ -27,6 +27,11 @@ FIGURES = {
         "bias_variance",
         "bias and variance of n-step and lambda-returns, and what n and lambda do to learning",
     ),
+    "5.1": (
+        "bellman_projection",
+        "a Bellman backup and the projection after it in the plane of the values of two states, and where many of them lead",
+    ),
+    "divergences": ("divergences", "Baird's example and w, 2w: which methods diverge, and which do not"),
     "7.1": (
         "fisher_ellipse",
         "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",

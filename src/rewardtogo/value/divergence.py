@@ -16,6 +16,8 @@ false on-policy (erratum E5.10). Averagers, whose fits are weighted means of the
 Source: notes, section 5.4; Tsitsiklis and Van Roy 1996 (w, 2w); Baird 1995.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -106,21 +108,39 @@ def follow(
     directions = {f.__name__: f for f in (semi_gradient, residual_gradient, sampled_residual_gradient)}
     if method not in (*directions, "gtd2", "tdc"):
         raise ValueError(f"there is no method {method!r}: choose one of {', '.join((*directions, 'gtd2', 'tdc'))}")
-    matrix, covariance = chain.key_matrix, chain.covariance
-    # γ Φ'P'D Φ: how the correction of TDC moves.
-    corrected = chain.gamma * (chain.transitions @ chain.features).T @ (chain.weights[:, None] * chain.features)
-    w, aside = chain.start.copy(), np.zeros_like(chain.start)
-    path = [w]
+    if method in directions:
+        slope, offset = _affine(directions[method], chain)
+        update, push = np.eye(len(slope)) + step * slope, step * offset
+    else:
+        update, push = _two_scales(chain, step, second_step, method == "gtd2")
+    point = np.concatenate([chain.start, np.zeros(len(push) - len(chain.start))])
+    path = [point]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(sweeps):
-            error = semi_gradient(chain, w)
-            if method in directions:
-                w = w + step * directions[method](chain, w)
-            else:
-                w = w + step * (matrix.T @ aside if method == "gtd2" else error - corrected @ aside)
-                aside = aside + second_step * (error - covariance @ aside)
-            path.append(w)
-    return np.stack(path)
+            point = update @ point + push
+            path.append(point)
+    return np.stack(path)[:, : len(chain.start)]
+
+
+def _affine(
+    direction: Callable[[Chain, np.ndarray], np.ndarray], chain: Chain
+) -> tuple[Float[np.ndarray, "F F"], Float[np.ndarray, "F"]]:
+    """Slope and offset of a direction, which is affine in w."""
+    size = len(chain.start)
+    offset = direction(chain, np.zeros(size))
+    return np.stack([direction(chain, e) - offset for e in np.eye(size)], 1), offset
+
+
+def _two_scales(
+    chain: Chain, step: float, second_step: float, gtd2: bool
+) -> tuple[Float[np.ndarray, "G G"], Float[np.ndarray, "G"]]:
+    """One update of (w, u): w moves by A'u (GTD2) or by b - A w - γ Φ'P'DΦ u (TDC), u by b - A w - C u."""
+    size, matrix, zero = len(chain.start), chain.key_matrix, np.zeros(len(chain.start))
+    corrected = chain.gamma * (chain.transitions @ chain.features).T @ (chain.weights[:, None] * chain.features)
+    top = [np.zeros((size, size)), matrix.T] if gtd2 else [-matrix, -corrected]
+    update = np.block([[step * part for part in top], [-second_step * matrix, -second_step * chain.covariance]])
+    push = np.concatenate([zero if gtd2 else step * chain.target, second_step * chain.target])
+    return np.eye(2 * size) + update, push
 
 
 def fit_on(chain: Chain, sweeps: int) -> Float[np.ndarray, "K S"]:
