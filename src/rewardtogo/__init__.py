@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from .runner.train import resume as resume
     from .runner.train import train as train
     from .value.dqn import DQN as DQN
+    from .value.tabular_q import QLearning as QLearning
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
@@ -84,6 +85,7 @@ _HOMES = {
     "runner.policy": "load",
     "runner.train": "Run resume train",
     "value.dqn": "DQN",
+    "value.tabular_q": "QLearning",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (
