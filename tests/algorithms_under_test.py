@@ -17,6 +17,8 @@ from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.value.exploration import Boltzmann
+from rewardtogo.value.tabular_q import QLearning
 
 NUM_ENVS = 4
 QUICK = {"xla_backend_optimization_level": 0}
@@ -112,6 +114,10 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "ddpg": lambda: continuous(rtg.DDPG(network=small, noise=rtg.OU(), normalise_observations=True)),
     "td3-lstm": lambda: continuous(rtg.TD3(network=lstm, noise=rtg.OU())),
     "sac": lambda: continuous(rtg.SAC(network=small, normalise_observations=True)),
+    "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
+    "double-q-learning": lambda: rtg.OnPolicy(
+        rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4
+    ),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),
 }

@@ -32,6 +32,7 @@ class Claim:
     seeds: int = 5
     backend: str = "auto"
     items: str = ""
+    episodes: int = 100
 
     def __str__(self) -> str:
         return f"{self.algorithm}-{self.env}-{self.backend}"
@@ -49,6 +50,9 @@ CLAIMS = [
     Claim("noisy_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("retrace_q", "CartPole-v1", 50_000, 475, seeds=4, items="6.19"),
     Claim("q_replay", "CartPole-v1", 50_000, 150, seeds=4, items="6.3"),
+    Claim("q_learning", "FrozenLake-v1", 1_000_000, 0.72, items="5.19", episodes=1000),
+    Claim("q_learning", "CliffWalking-v1", 100_000, -13, items="5.19", episodes=1000),
+    Claim("q_learning", "Taxi-v4", 500_000, 7.8, items="5.19", episodes=1000),
     Claim("reinforce", "CartPole-v1", 300_000, 475, seeds=4, items="3.6"),
     Claim("vpg", "CartPole-v1", 200_000, 475, seeds=4),
     Claim("batch_ac", "CartPole-v1", 300_000, 475, seeds=4, items="4.16"),
@@ -78,7 +82,7 @@ def test_score(claim: Claim, tmp_path: Path, item: Any) -> None:
         quiet=True,
     )
     backend = "gymnasium" if claim.env in gymnasium.registry and claim.env in COMPILED else None
-    scores = [evaluate_run(str(run.path), episodes=100, backend=backend)["return_mean"] for run in runs]
+    scores = [evaluate_run(str(run.path), episodes=claim.episodes, backend=backend)["return_mean"] for run in runs]
     print(f"\n{claim}: {claim.steps} steps, returns {', '.join(f'{s:.1f}' for s in sorted(scores))}")
     reached = sum(score >= claim.score for score in scores)
     for name in claim.items.split():

@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from .value.outputs import Expectation as Expectation
     from .value.outputs import Quantiles as Quantiles
     from .value.sac import SAC as SAC
+    from .value.tabular_q import QLearning as QLearning
     from .value.td3 import TD3 as TD3
 
 _HOMES = {
@@ -108,6 +109,7 @@ _HOMES = {
     "value.outputs": "C51 Expectation Quantiles",
     "value.sac": "SAC",
     "value.td3": "TD3",
+    "value.tabular_q": "QLearning",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (

@@ -167,6 +167,16 @@ ALGORITHMS: dict[str, Row] = {
             "proximal policy optimisation, clipped surrogate and GAE",
         ),
         Row(
+            "fqi",
+            "rewardtogo.value.dqn:DQN",
+            "offline",
+            "5",
+            "Alg 9",
+            ("discrete",),
+            "fitted Q-iteration on a dataset: regressions, one after the other, on targets that stay meanwhile",
+            {"target_period": 500, "huber": 1e6, "learning_rate": 1e-3},
+        ),
+        Row(
             "q_learning",
             "rewardtogo.value.tabular_q:QLearning",
             "on_policy",

@@ -144,6 +144,16 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "double": True,
         },
     },
+    # Undiscounted returns are what counts here: on the lake it takes a discount near 1.
+    ("q_learning", "FrozenLake-v1"): {
+        "steps": 1_000_000,
+        "learner": {
+            "gamma": 0.999,
+            "exploration": {"class": "epsilongreedy", "epsilon": "linear:1:0.1:0.5", "ties": "uniform"},
+        },
+    },
+    ("q_learning", "CliffWalking-v1"): {"steps": 100_000},
+    ("q_learning", "Taxi-v4"): {"steps": 500_000},
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,

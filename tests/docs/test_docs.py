@@ -201,7 +201,8 @@ def test_every_public_name_is_on_the_api_page():
 
 def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
     """The smallest algorithm of a row of the catalogue."""
-    env, learner = rtg.make(env_name, 2), build(resolve(row.path), row.learner)
+    learner = build(resolve(row.path), row.learner)
+    env = rtg.make("FrozenLake-v1" if isinstance(learner, rtg.QLearning) else env_name, 2)
     if row.loop == "on_policy":
         return rtg.OnPolicy(env, learner, unroll=8)
     if row.loop == "asynchronous":

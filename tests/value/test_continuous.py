@@ -230,7 +230,7 @@ def test_td3_moves_actor_and_targets_every_other_update():
     for _ in range(4):
         states.append(step(states[-1], batch()))
     moved = lambda part, i: (
-        not np.array_equal(  # noqa: E731
+        not np.array_equal(
             jax.tree.leaves(getattr(states[i], part))[0], jax.tree.leaves(getattr(states[i - 1], part))[0]
         )
     )

@@ -1,13 +1,13 @@
-r"""Tabular Q-learning and double Q-learning, online, nothing stored (chapter 5, Algorithm 10, Watkins and Dayan 1992; 6.3, van Hasselt 2010).
+r"""Tabular Q-learning, plain and double, online, nothing stored (Algorithm 10, Watkins and Dayan 1992; 6.3, van Hasselt 2010).
 
 After every step
 
 $$Q(s, a) \leftarrow Q(s, a) + \alpha\, (y - Q(s, a)), \qquad y = r + \gamma\, (1 - \text{terminated}) \max_{a'} Q(s', a'),
 \qquad \alpha = \frac{\text{learning rate}}{n(s, a)^{\text{decay}}}$$
 
-where $n(s, a)$ counts the visits. With $\tfrac12 <$ decay $\le 1$ the sum of $\alpha$ diverges and that of $\alpha^2$ does not, and Q converges
-to $Q^\star$ whatever policy acts, as long as it leaves nothing out for ever (erratum E5.11: although it is no gradient descent). The notes
-print $\max_{a'} Q(s_i, a_i, s'_i, r_i)$ in the target (erratum E5.6).
+where $n(s, a)$ counts the visits. With $\tfrac12 <$ decay $\le 1$ the sum of $\alpha$ diverges and that of $\alpha^2$ does not, and Q
+converges to $Q^\star$ whatever policy acts, as long as it leaves nothing out for ever (erratum E5.11: although it is no gradient descent).
+The notes print $\max_{a'} Q(s_i, a_i, s'_i, r_i)$ in the target (erratum E5.6).
 
 *Double*: two tables, a coin decides which of them learns, the one that learns chooses the next action and the other values it:
 
