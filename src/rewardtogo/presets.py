@@ -71,15 +71,6 @@ PRESETS: dict[tuple[str, str], Preset] = {
     },
     # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
     ("dqn", "CartPole-v1"): _DQN_CARTPOLE,
-    ("dqn", "Catch"): {
-        "steps": 20_000,
-        "num_envs": 4,
-        "loop": {"unroll": 4, "updates": 2, "batch_size": 32},
-        "learner": {
-            "network": {"class": "cnn", "channels": [16], "kernels": [3], "strides": [1], "sizes": [64]},
-            "epsilon": "linear:1:0.05:0.5",
-        },
-    },
     ("double_dqn", "CartPole-v1"): _DQN_CARTPOLE,
     ("dueling_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64]),
     ("noisy_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64], epsilon=0.0),
