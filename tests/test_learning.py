@@ -40,7 +40,7 @@ CLAIMS = [
     Claim("ppo", "CartPole-v1", 100_000, 475, backend="gymnasium"),
     Claim("dqn", "CartPole-v1", 50_000, 475, seeds=4),
     Claim("per_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
-    Claim("dqn", "Catch", 20_000, 0.95, items="6.6"),
+    Claim("dqn", "Catch", 40_000, 0.95, items="6.6"),
     Claim("reinforce", "CartPole-v1", 300_000, 475, seeds=4, items="3.6"),
     Claim("vpg", "CartPole-v1", 200_000, 475, seeds=4),
     Claim("batch_ac", "CartPole-v1", 300_000, 475, seeds=4, items="4.16"),
