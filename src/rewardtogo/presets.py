@@ -125,11 +125,11 @@ PRESETS: dict[tuple[str, str], Preset] = {
         },
     },
     ("dqn", "Catch"): {
-        "steps": 20_000,
+        "steps": 40_000,
         "num_envs": 8,
-        "loop": {"unroll": 4, "updates": 4, "batch_size": 32, "warm_up": 1000, "replay": {"capacity": 10_000}},
+        "loop": {"unroll": 4, "updates": 8, "batch_size": 32, "warm_up": 1000, "replay": {"capacity": 10_000}},
         "learner": {
-            "learning_rate": "linear:1e-3:0",
+            "learning_rate": "linear:1e-3:1e-4",
             "network": {"class": "cnn", "channels": [8, 8], "kernels": [3, 3], "strides": [1, 1], "sizes": [64]},
             "target_period": 100,
             "double": True,
