@@ -257,6 +257,85 @@ def dqn(size: "Size") -> list[Row]:
     ]
 
 
+def one_against(name: str, size: "Size", steps: int, what: str, peer: str, least: float) -> list[Row]:
+    """One algorithm beside one of Stable-Baselines3's."""
+    found = measure({"ours": ours("train", name, "--steps", steps), "sb3": sb3(name, steps)}, size.repeats)
+    return [against(f"{what}, {steps:,} steps", found["ours"], peer, found["sb3"], least)]
+
+
+def a2c(size: "Size") -> list[Row]:
+    """A2C beside Stable-Baselines3's."""
+    return one_against("a2c", size, size.ppo, "A2C, CartPole-v1, 8 x 5 steps, 64x64 tanh", peer_name("sb3"), 15)
+
+
+def trpo(size: "Size") -> list[Row]:
+    """TRPO beside sb3-contrib's."""
+    what = "TRPO, CartPole-v1, 8 x 256 steps, 15 iterations of conjugate gradients, 64x64 tanh"
+    return one_against("trpo", size, size.ppo, what, "sb3-contrib", 8)
+
+
+def recurrent(size: "Size") -> list[Row]:
+    """PPO with a memory beside sb3-contrib's."""
+    what = "recurrent PPO, CartPole without velocities, LSTM of 64, 8 x 128 steps, 4 x 4 minibatches"
+    return one_against("recurrent", size, size.recurrent, what, "sb3-contrib", 10)
+
+
+def cheetah(size: "Size") -> list[Row]:
+    """PPO in a MuJoCo environment, from the shell's prompt to the shell's prompt."""
+    steps = size.cheetah
+    options = (
+        "--preset none --num-envs 8 --loop.unroll 256 --learner.epochs 10 --learner.minibatches 32 "
+        "--learner.learning-rate 3e-4 --quiet --json"
+    ).split()
+    base = [str(Path(sys.executable).with_name("rtg")), "train", "ppo", "HalfCheetah-v5", "--steps", str(steps)]
+    with tempfile.TemporaryDirectory() as folder:
+        number = iter(range(10**6))
+        contenders = {
+            backend: Contender(
+                lambda backend=backend: [*base, *options, "--backend", backend, "--out", f"{folder}/{next(number)}"]
+            )
+            for backend in ("gymnasium", "envpool")
+        }
+        found = measure({**contenders, "sb3": sb3("cheetah", steps)}, size.repeats)
+    rows, theirs = [], found["sb3"]
+    for backend in contenders:
+        mine = found[backend]
+        failed = "error" in mine or "error" in theirs
+        ratio = None if failed else theirs["process_seconds"] / mine["process_seconds"]
+        rows.append(
+            Row(
+                f"`rtg train ppo HalfCheetah-v5 --backend {backend}`, whole process, {steps:,} steps, 8 x 256, 10 x 32 minibatches",
+                mine.get("error") or f"{mine['process_seconds']:.1f} s (return {mine['return_mean']:.0f})",
+                f"{peer_name('sb3')}: " + (theirs.get("error") or f"{theirs['process_seconds']:.1f} s"),
+                ratio,
+                "≥ 1.5 x",
+                None if "error" in theirs else ratio is not None and ratio >= 1.5,
+            )
+        )
+    return rows
+
+
+def continuous(size: "Size") -> list[Row]:
+    """SAC and TD3 beside SB3, and beside the products of matrices that they need."""
+    rows = []
+    for name in ("sac", "td3"):
+        found = measure(
+            {"ours": ours("train", name, "--steps", size.continuous), "sb3": sb3(name, size.continuous)}, size.repeats
+        )
+        what = (
+            f"{name.upper()}, Pendulum-v1, 1 environment, batch 256 every step, 256x256 ReLU, {size.continuous:,} steps"
+        )
+        rows.append(against(what, found["ours"], peer_name("sb3"), found["sb3"], 2))
+        result = measure({"dots": ours("dots", name, "--repeats", size.laps)}, 1)["dots"]
+        title = f"{name.upper()}, a whole step against `jnp.dot` on the shapes it needs, in a scan"
+        if "error" in result:
+            rows.append(Row(title, result["error"], "", None, "≥ 0.6", False))
+            continue
+        mine, other = f"{result['step_ms']:.2f} ms, {result['gflops']:.0f} GFLOP/s", f"{result['dots_ms']:.2f} ms"
+        rows.append(Row(title, mine, other, result["ratio"], "≥ 0.6", result["ratio"] >= 0.6))
+    return rows
+
+
 def zoo(size: "Size") -> list[Row]:
     """From the shell's prompt to the shell's prompt."""
     steps = size.zoo
@@ -349,7 +428,20 @@ def memory(size: "Size") -> list[Row]:
     return [row]
 
 
-GROUPS = {"ppo": ppo, "dqn": dqn, "zoo": zoo, "seeds": seeds, "door": door, "start": start, "memory": memory}
+GROUPS = {
+    "ppo": ppo,
+    "dqn": dqn,
+    "a2c": a2c,
+    "trpo": trpo,
+    "recurrent": recurrent,
+    "cheetah": cheetah,
+    "continuous": continuous,
+    "zoo": zoo,
+    "seeds": seeds,
+    "door": door,
+    "start": start,
+    "memory": memory,
+}
 
 
 @dataclass
@@ -360,11 +452,16 @@ class Size:
     laps: int = 7
     ppo: int = 204_800
     dqn: int = 30_000
+    continuous: int = 4_000
     zoo: int = 100_000
     memory: int = 40_000
+    recurrent: int = 61_440
+    cheetah: int = 102_400
 
 
-QUICK = Size(repeats=1, laps=3, ppo=10_240, dqn=2_000, zoo=4_096, memory=8_000)
+QUICK = Size(
+    repeats=1, laps=3, ppo=10_240, dqn=2_000, zoo=4_096, memory=8_000, recurrent=8_192, cheetah=8_192, continuous=400
+)
 
 
 # --- the table ---------------------------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -18,14 +19,55 @@ from rewardtogo.cli.commands import use_cache
 from rewardtogo.runner.engine import Program
 
 ENV = "CartPole-v1"
-PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"sizes": [64, 64]}}
-DQN: dict[str, Any] = {"learning_rate": 1e-3, "target_period": 250}
+TWO = {"network": {"sizes": [64, 64]}}
+PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, **TWO}
+EVERY_STEP: dict[str, Any] = {
+    "batch_size": 256,
+    "unroll": 1,
+    "updates": 1,
+    "warm_up": 1000,
+    "replay": {"capacity": 100_000},
+}
 OFF: dict[str, Any] = {"batch_size": 64, "unroll": 4, "updates": 1, "warm_up": 1000, "replay": {"capacity": 100_000}}
+
+
+@dataclass
+class Task:
+    """What is trained: the peers' scripts have the same settings."""
+
+    algorithm: str
+    learner: dict[str, Any]
+    loop: dict[str, Any]
+    num_envs: int = 8
+    env: str = ENV
+
+
+TRAINED = {
+    "ppo": Task("ppo", PPO, {"unroll": 128}),
+    "dqn": Task("dqn", {"learning_rate": 1e-3, "target_period": 250}, OFF, num_envs=1),
+    "a2c": Task("a2c", TWO, {"unroll": 5}),
+    # 160 steps of the value function a rollout, as sb3-contrib takes: ten passes of 128 samples each.
+    "trpo": Task("trpo", {"value_epochs": 10, "minibatches": 16, "cg_iterations": 15, **TWO}, {"unroll": 256}),
+    "recurrent": Task(
+        "ppo",
+        {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"class": "lstm", "size": 64}},
+        {"unroll": 128},
+        env="CartPoleNoVel-v1",
+    ),
+    **{
+        name: Task(name, {"network": {"sizes": [256, 256]}}, EVERY_STEP, num_envs=1, env="Pendulum-v1")
+        for name in ("sac", "td3")
+    },
+}
 
 
 def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
     """The algorithm of a row, put together."""
-    if name == "ppo":
+    if name in ("sac", "td3"):
+        learner = {"sac": rtg.SAC, "td3": rtg.TD3}[name](network=rtg.MLP(256, 256, activation="relu"))
+        env, replay = rtg.make("Pendulum-v1", num_envs=1), rtg.UniformReplay(capacity)
+        whole = rtg.OffPolicy(env, learner, replay, batch_size=256, unroll=1, warm_up=1000)
+    elif name == "ppo":
         learner = rtg.PPO(learning_rate=3e-4, epochs=4, minibatches=4, network=rtg.MLP(64, 64))
         whole = rtg.OnPolicy(rtg.make(ENV, num_envs=8), learner, unroll=128)
     else:
@@ -38,19 +80,19 @@ def algorithm(name: str, capacity: int = 100_000) -> rtg.Algorithm:
 def train(given: argparse.Namespace) -> dict[str, Any]:
     """A whole run with its folder, metrics and evaluations: steps a second as the library itself reports them."""
     seen: list[tuple[int, float, float]] = []
-    on_policy = given.name == "ppo"
+    task = TRAINED[given.name]
     with tempfile.TemporaryDirectory() as folder:
         run = rtg.train(
-            given.name,
-            ENV,
-            steps=given.steps + (0 if on_policy else OFF["warm_up"]),
+            task.algorithm,
+            task.env,
+            steps=given.steps + task.loop.get("warm_up", 0),
             seed=given.seed,
-            num_envs=8 if on_policy else 1,
+            num_envs=task.num_envs,
             out=f"{folder}/run",
             backend=given.backend,
             preset="none",
-            learner=PPO if on_policy else DQN,
-            loop={"unroll": 128} if on_policy else OFF,
+            learner=task.learner,
+            loop=task.loop,
             callbacks=[lambda moment: seen.append((moment.env_steps, moment.seconds, moment.compile_seconds))],
             quiet=True,
         )
@@ -164,14 +206,77 @@ def memory(given: argparse.Namespace) -> dict[str, Any]:
     return {"peak": peak / 1e6, "arrays": arrays / 1e6, "beside": (peak - arrays) / 1e6}
 
 
-TASKS = {"train": train, "seeds": seeds, "door": door, "start": start, "memory": memory}
+def products(name: str) -> list[tuple[tuple[int, int, int], float]]:
+    """The products of matrices `(m, k, n)` that a step of SAC or TD3 cannot do without, and how many of each a step takes.
+
+    Two critics of 4 inputs, an actor of 3; a hidden width of 256 and a batch of 256; TD3's actor learns in every other step.
+    """
+    n, h, outputs = 256, 256, 2 if name == "sac" else 1
+    forward = lambda inputs, outputs: [(n, inputs, h), (n, h, h), (n, h, outputs)]  # noqa: E731
+    weights = lambda inputs, outputs: [(inputs, n, h), (h, n, h), (h, n, outputs)]  # noqa: E731
+    inside = lambda outputs: [(n, h, h), (n, outputs, h)]  # noqa: E731
+    targets = forward(3, outputs) + 2 * forward(4, 1)
+    critics = 2 * (forward(4, 1) + weights(4, 1) + inside(1))
+    judges, share = (2, 1.0) if name == "sac" else (1, 0.5)
+    actor = forward(3, outputs) + weights(3, outputs) + inside(outputs)
+    actor += judges * (forward(4, 1) + inside(1) + [(n, h, 1)])  # down to the action
+    return [(shape, 1.0) for shape in targets + critics] + [(shape, share) for shape in actor]
+
+
+def stopwatch_of(shapes: list[tuple[int, int, int]], length: int) -> Callable[[], float]:
+    """Seconds of one `jnp.dot` of each shape, one after another in a scan, every result kept."""
+    keys = jax.random.split(jax.random.key(0), 2 * len(shapes))
+    left = [jax.random.normal(k, (m, inner)) for k, (m, inner, _) in zip(keys[::2], shapes, strict=True)]
+    right = [jax.random.normal(k, (inner, n)) for k, (_, inner, n) in zip(keys[1::2], shapes, strict=True)]
+
+    @jax.jit
+    def program(left: Any, right: Any) -> Any:
+        def body(loop: Any, _: None) -> Any:
+            left, old = loop
+            # A number of the last results goes into the operands, so that nothing can be taken out of the loop.
+            left = [a.at[0, 0].set(1e-3 * y[0, 0]) for a, y in zip(left, old, strict=True)]
+            return (left, [jax.numpy.dot(a, b) for a, b in zip(left, right, strict=True)]), None
+
+        first = [jax.numpy.dot(a, b) for a, b in zip(left, right, strict=True)]
+        return jax.lax.scan(body, (left, first), None, length=length)[0]
+
+    jax.block_until_ready(program(left, right))
+
+    def lap() -> float:
+        started = time.perf_counter()
+        jax.block_until_ready(program(left, right))
+        return (time.perf_counter() - started) / length
+
+    return lap
+
+
+def dots(given: argparse.Namespace) -> dict[str, Any]:
+    """A whole step of SAC or TD3 (act, store, draw, learn) against nothing but the products of matrices that it needs."""
+    step = clock(Program(algorithm(given.name), jax.random.key(given.seed), 10**6), 200)
+    needed = products(given.name)
+    always = stopwatch_of([shape for shape, share in needed if share == 1.0], 200)
+    sometimes = [shape for shape, share in needed if share < 1.0]
+    rest = stopwatch_of(sometimes, 200) if sometimes else lambda: 0.0
+    share = min(share for _, share in needed)
+    laps = [(step(), always() + share * rest()) for _ in range(given.repeats)]
+    operations = sum(2 * m * k * n * share for (m, k, n), share in needed)
+    # Neighbours in time are compared: the load of a shared machine moves slowly.
+    return {
+        "step_ms": 1e3 * statistics.median(a for a, _ in laps),
+        "dots_ms": 1e3 * statistics.median(b for _, b in laps),
+        "ratio": statistics.median(b / a for a, b in laps),
+        "gflops": operations / 1e9 / statistics.median(a for a, _ in laps),
+    }
+
+
+TASKS = {"dots": dots, "train": train, "seeds": seeds, "door": door, "start": start, "memory": memory}
 
 
 def main() -> None:
     """Measure one thing."""
     parser = argparse.ArgumentParser()
     parser.add_argument("task", choices=TASKS)
-    parser.add_argument("name", nargs="?", choices=["ppo", "dqn"], default="ppo")
+    parser.add_argument("name", nargs="?", choices=TRAINED, default="ppo")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=5)

@@ -14,8 +14,11 @@ import rewardtogo as rtg
 from rewardtogo.core import MASK, Algorithm, Environment, Timestep, Transition, env_spec
 from rewardtogo.data import Dataset
 from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.value.exploration import Boltzmann
+from rewardtogo.value.tabular_q import QLearning
 
 NUM_ENVS = 4
 QUICK = {"xla_backend_optimization_level": 0}
@@ -36,9 +39,15 @@ def on_policy(learner: Any, **options: Any) -> Algorithm:
     return rtg.OnPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, **{"unroll": 8, **options})
 
 
-def off_policy(learner: Any, **options: Any) -> Algorithm:
+def off_policy(learner: Any, replay: Any = rtg.UniformReplay(256), **options: Any) -> Algorithm:
     options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
-    return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, rtg.UniformReplay(256), **options)
+    return rtg.OffPolicy(rtg.vectorize(small_env(), NUM_ENVS), learner, replay, **options)
+
+
+def continuous(learner: Any, **options: Any) -> Algorithm:
+    """Off-policy with continuous actions: Pendulum, cut after 16 steps."""
+    options = {"unroll": 2, "updates": 2, "batch_size": 8, "warm_up": 32, "length": 4} | options
+    return rtg.OffPolicy(rtg.vectorize(TimeLimit(Pendulum(), 16), NUM_ENVS), learner, rtg.UniformReplay(256), **options)
 
 
 @functools.cache
@@ -86,6 +95,8 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
         "random",
     ),
     "dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2, normalise_observations=True)),
+    "per-dqn": lambda: off_policy(rtg.DQN(network=small, target_period=2), rtg.PrioritisedReplay(256)),
+    "per-dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, target_period=2), rtg.PrioritisedReplay(256)),
     "dqn-n-step": lambda: off_policy(rtg.DQN(network=small, n_step=3, target_period=2)),
     "c51-dueling-noisy": lambda: off_policy(
         rtg.DQN(
@@ -98,6 +109,15 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
         rtg.DQN(network=lstm, burn_in=1, n_step=2, double=True, outputs=rtg.Expectation(rescale=True), target_period=2)
     ),
     "dqn-lstm": lambda: off_policy(rtg.DQN(network=lstm, double=True, target_period=1, target_rate=0.1)),
+    "cem-q": lambda: continuous(rtg.CEMQ(network=small, maximiser=rtg.CEM(2, 8, 2), normalise_observations=True)),
+    "naf": lambda: continuous(rtg.NAF(network=small, n_step=3)),
+    "ddpg": lambda: continuous(rtg.DDPG(network=small, noise=rtg.OU(), normalise_observations=True)),
+    "td3-lstm": lambda: continuous(rtg.TD3(network=lstm, noise=rtg.OU())),
+    "sac": lambda: continuous(rtg.SAC(network=small, normalise_observations=True)),
+    "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
+    "double-q-learning": lambda: rtg.OnPolicy(
+        rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4
+    ),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),
 }

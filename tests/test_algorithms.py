@@ -23,7 +23,7 @@ from rewardtogo.runner.config import build, options, resolve
 HORIZON = 10
 KEYS = [jax.random.key(seed) for seed in (0, 1)]
 every = pytest.mark.parametrize("name", ALGORITHMS_UNDER_TEST)
-VARIANTS = {"ppo-gru", "dqn", "dqn-lstm", "qr-dqn", "bc-gru"}
+VARIANTS = {"ppo-gru", "dqn", "dqn-lstm", "qr-dqn", "bc-gru", "per-dqn-lstm", "ddpg", "naf"}
 """Rows of algorithms that another row stands for in the tests that compile a program of their own."""
 each_algorithm = pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n in VARIANTS else n for n in ALGORITHMS_UNDER_TEST]

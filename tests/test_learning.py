@@ -12,7 +12,9 @@ import gymnasium
 import pytest
 
 import rewardtogo as rtg
+from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.registry import COMPILED
+from rewardtogo.envs.time_limit import FiniteHorizon
 from rewardtogo.runner.evaluate_run import evaluate_run
 
 pytestmark = pytest.mark.slow
@@ -30,6 +32,7 @@ class Claim:
     seeds: int = 5
     backend: str = "auto"
     items: str = ""
+    episodes: int = 100
 
     def __str__(self) -> str:
         return f"{self.algorithm}-{self.env}-{self.backend}"
@@ -40,12 +43,16 @@ CLAIMS = [
     Claim("ppo", "CartPole-v1", 100_000, 475, backend="gymnasium"),
     Claim("dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.5 6.6 6.14"),
     Claim("dqn", "Catch", 20_000, 0.95, items="6.6"),
+    Claim("per_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("c51", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("qr_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("dueling_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("noisy_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("retrace_q", "CartPole-v1", 50_000, 475, seeds=4, items="6.19"),
     Claim("q_replay", "CartPole-v1", 50_000, 150, seeds=4, items="6.3"),
+    Claim("q_learning", "FrozenLake-v1", 1_000_000, 0.72, items="5.19", episodes=1000),
+    Claim("q_learning", "CliffWalking-v1", 100_000, -13, items="5.19", episodes=1000),
+    Claim("q_learning", "Taxi-v4", 500_000, 7.8, items="5.19", episodes=1000),
     Claim("reinforce", "CartPole-v1", 300_000, 475, seeds=4, items="3.6"),
     Claim("vpg", "CartPole-v1", 200_000, 475, seeds=4),
     Claim("batch_ac", "CartPole-v1", 300_000, 475, seeds=4, items="4.16"),
@@ -75,7 +82,7 @@ def test_score(claim: Claim, tmp_path: Path, item: Any) -> None:
         quiet=True,
     )
     backend = "gymnasium" if claim.env in gymnasium.registry and claim.env in COMPILED else None
-    scores = [evaluate_run(str(run.path), episodes=100, backend=backend)["return_mean"] for run in runs]
+    scores = [evaluate_run(str(run.path), episodes=claim.episodes, backend=backend)["return_mean"] for run in runs]
     print(f"\n{claim}: {claim.steps} steps, returns {', '.join(f'{s:.1f}' for s in sorted(scores))}")
     reached = sum(score >= claim.score for score in scores)
     for name in claim.items.split():
@@ -88,3 +95,26 @@ def test_score(claim: Claim, tmp_path: Path, item: Any) -> None:
             )
             check(reached, ">=", claim.seeds, f"{claim}: seeds that reach it")
     assert reached >= claim.seeds, scores
+
+
+def test_batch_actor_critic_without_a_discount(tmp_path: Path, item: Any) -> None:
+    """Algorithm 3 has gamma = 1, which makes sense where an episode ends: time limit an end, and seen (erratum E1.2).
+
+    V is fitted to lambda-returns: with Monte-Carlo sums of rollouts that cut episodes two seeds of five got there.
+    """
+    runs = rtg.train(
+        "batch_ac",
+        FiniteHorizon(CartPole(), 500),
+        steps=300_000,
+        num_seeds=SEEDS,
+        num_envs=8,
+        loop={"unroll": 128},
+        learner={"gamma": 1.0, "value_target": "td_lambda"},
+        preset="none",
+        out=tmp_path / "run",
+        quiet=True,
+    )
+    scores = [run.evaluation["return_mean"] for run in runs]
+    with item("4.15") as check:
+        check(statistics.median(scores), ">=", 475, f"batch_ac, gamma 1: median return of {SEEDS} seeds, 300,000 steps")
+        check(sum(score >= 475 for score in scores), ">=", 4, "seeds that reach it")

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from .core import number as number
     from .core import part as part
     from .core import setting as setting
+    from .data.prioritised import PrioritisedReplay as PrioritisedReplay
+    from .data.replay import Replay as Replay
     from .data.replay import UniformReplay as UniformReplay
     from .envs.gymnasium import EnvironmentFailure as EnvironmentFailure
     from .envs.gymnasium import GymnasiumEnv as GymnasiumEnv
@@ -58,16 +60,28 @@ if TYPE_CHECKING:
     from .runner.train import Run as Run
     from .runner.train import resume as resume
     from .runner.train import train as train
+    from .value.cem_q import CEMQ as CEMQ
+    from .value.ddpg import DDPG as DDPG
     from .value.dqn import DQN as DQN
+    from .value.maximisers import CEM as CEM
+    from .value.maximisers import Ascent as Ascent
+    from .value.maximisers import Sampled as Sampled
+    from .value.naf import NAF as NAF
+    from .value.noise import OU as OU
+    from .value.noise import Gaussian as Gaussian
     from .value.outputs import C51 as C51
     from .value.outputs import Expectation as Expectation
     from .value.outputs import Quantiles as Quantiles
+    from .value.sac import SAC as SAC
+    from .value.tabular_q import QLearning as QLearning
+    from .value.td3 import TD3 as TD3
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
     "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
     "number part setting",
-    "data.replay": "UniformReplay",
+    "data.prioritised": "PrioritisedReplay",
+    "data.replay": "Replay UniformReplay",
     "envs.gymnasium": "EnvironmentFailure GymnasiumEnv",
     "envs.registry": "make",
     "envs.vectorize": "vectorize",
@@ -86,8 +100,16 @@ _HOMES = {
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
     "runner.train": "Run resume train",
+    "value.cem_q": "CEMQ",
+    "value.ddpg": "DDPG",
     "value.dqn": "DQN",
+    "value.maximisers": "Ascent CEM Sampled",
+    "value.naf": "NAF",
+    "value.noise": "Gaussian OU",
     "value.outputs": "C51 Expectation Quantiles",
+    "value.sac": "SAC",
+    "value.td3": "TD3",
+    "value.tabular_q": "QLearning",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 _ROOMS = (

@@ -71,15 +71,6 @@ PRESETS: dict[tuple[str, str], Preset] = {
     },
     # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
     ("dqn", "CartPole-v1"): _DQN_CARTPOLE,
-    ("dqn", "Catch"): {
-        "steps": 20_000,
-        "num_envs": 4,
-        "loop": {"unroll": 4, "updates": 2, "batch_size": 32},
-        "learner": {
-            "network": {"class": "cnn", "channels": [16], "kernels": [3], "strides": [1], "sizes": [64]},
-            "epsilon": "linear:1:0.05:0.5",
-        },
-    },
     ("double_dqn", "CartPole-v1"): _DQN_CARTPOLE,
     ("dueling_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64]),
     ("noisy_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64], epsilon=0.0),
@@ -98,6 +89,62 @@ PRESETS: dict[tuple[str, str], Preset] = {
         **_dqn_cartpole(n_step=1, traces="retrace", trace_decay=0.9, target_period=200),
         "loop": {"unroll": 4, "updates": 2, "batch_size": 16, "length": 8},
     },
+    ("per_dqn", "CartPole-v1"): {
+        "steps": 50_000,
+        "num_envs": 1,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "length": 8},
+        "learner": {
+            "learning_rate": "linear:1e-3:1e-4",
+            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
+            "epsilon": "linear:1:0.1:0.12",
+            "n_step": 8,
+            "target_period": 400,
+            "double": True,
+            "huber": 10.0,
+            "max_grad_norm": 100.0,
+        },
+    },
+    # The settings that published code shares (batches of 32 every 4 steps, a target every 1000, Adam at 1e-4), with a replay that most
+    # machines can hold: 0.8 GB. Two cores are too slow to train a game to its end, so that no score of ours stands behind it.
+    ("dqn", "ALE/*"): {
+        "steps": 2_500_000,
+        "num_envs": 8,
+        "loop": {
+            "unroll": 4,
+            "updates": 8,
+            "batch_size": 32,
+            "warm_up": 20_000,
+            "replay": {"capacity": 100_000, "frames": 4},
+        },
+        "learner": {
+            "learning_rate": 1e-4,
+            "network": {"class": "cnn"},
+            "epsilon": "linear:1:0.01:0.1",
+            "target_period": 250,
+            "double": True,
+        },
+    },
+    ("dqn", "Catch"): {
+        "steps": 20_000,
+        "num_envs": 8,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 32, "warm_up": 1000, "replay": {"capacity": 10_000}},
+        "learner": {
+            "learning_rate": "linear:1e-3:0",
+            "network": {"class": "cnn", "channels": [8, 8], "kernels": [3, 3], "strides": [1, 1], "sizes": [64]},
+            "target_period": 100,
+            "double": True,
+        },
+    },
+    # Undiscounted returns are what counts here: on the lake it takes a discount near 1.
+    ("q_learning", "FrozenLake-v1"): {
+        "steps": 1_000_000,
+        "learner": {
+            "gamma": 0.999,
+            "exploration": {"class": "epsilongreedy", "epsilon": "linear:1:0.1:0.5", "ties": "uniform"},
+        },
+    },
+    ("q_learning", "CliffWalking-v1"): {"steps": 100_000},
+    ("q_learning", "Taxi-v4"): {"steps": 500_000},
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,
@@ -120,9 +167,9 @@ PRESETS: dict[tuple[str, str], Preset] = {
     ("async_ac", "CartPole-v1"): {"steps": 300_000},
     ("reinforce", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
 }
-"""Keys are the algorithm's name and the environment's id."""
+"""Keys are the algorithm's name and the environment's id, or `NAMESPACE/*` for all of a namespace that have none of their own."""
 
 
 def preset(algorithm: str, env: str) -> Preset:
     """The preset of a pair, `{}` where there is none."""
-    return PRESETS.get((algorithm, env), {})
+    return PRESETS.get((algorithm, env)) or PRESETS.get((algorithm, f"{env.split('/')[0]}/*"), {})

@@ -138,6 +138,9 @@ def test_command_is_one(page, line, monkeypatch):
         assert class_of(words[0])
         return
     given, rest = TABLE[command].parse_known_args(words)
+    if command == "solve":
+        assert set(_nested(rest, ("env",), "solve")) == {"env"}
+        return
     if command != "train":
         assert not rest
         return
@@ -151,7 +154,10 @@ def test_command_is_one(page, line, monkeypatch):
 
 def known_options() -> set[str]:
     """Every option of every command, algorithm, loop and part."""
-    found = set().union(*OPTIONS.values(), {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY"})
+    found = set().union(
+        *OPTIONS.values(),
+        {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY", "--env.normalise-reward"},
+    )
     found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD"}
     classes = [("learner", class_of(name)) for name in ALGORITHMS] + [
         ("loop", resolve(path)) for path in LOOPS.values()
@@ -195,7 +201,8 @@ def test_every_public_name_is_on_the_api_page():
 
 def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
     """The smallest algorithm of a row of the catalogue."""
-    env, learner = rtg.make(env_name, 2), build(resolve(row.path), row.learner)
+    learner = build(resolve(row.path), row.learner)
+    env = rtg.make("FrozenLake-v1" if isinstance(learner, rtg.QLearning) else env_name, 2)
     if row.loop == "on_policy":
         return rtg.OnPolicy(env, learner, unroll=8)
     if row.loop == "asynchronous":

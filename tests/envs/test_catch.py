@@ -1,42 +1,91 @@
+"""Catch, played by hand and by the best policy; and memories of its pictures, stored once and stored whole."""
+
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import rewardtogo as rtg
 from algorithms_under_test import jit
-from rewardtogo.envs.catch import Catch
+from rewardtogo.envs import Catch, FrameStack
+from rewardtogo.envs.catch import CatchState
 
-ENV = Catch()
-
-
-def play(key, policy):
-    """Pictures, rewards and ends of an episode of the default board."""
-
-    def step(loop, _):
-        state, t = ENV.step(loop[0], policy(loop[0]), key)
-        return (state, t.observation), (t.observation, t.reward, t.terminated)
-
-    state, first = ENV.reset(key)
-    return first, *jax.lax.scan(step, (state, first), None, length=9)[1]
+KEY = jax.random.key(0)
 
 
-def test_a_game_by_hand():
-    """The ball falls a row a step; chasing it always catches it, fleeing from it never does."""
-    chase = lambda s: jnp.sign(s.column - s.paddle) + 1  # noqa: E731
-    flee = lambda s: jnp.where(s.column < 2, 2, 0)  # noqa: E731
-    keys = jax.random.split(jax.random.key(0), 40)
-    for policy, worth in ((chase, 1.0), (flee, -1.0)):
-        first, pictures, rewards, ends = jit(jax.vmap(lambda k: play(k, policy)))(keys)  # noqa: B023
-        np.testing.assert_array_equal(rewards, [[0.0] * 8 + [worth]] * 40)
-        np.testing.assert_array_equal(ends, [[False] * 8 + [True]] * 40)
-    assert first.dtype == jnp.uint8
-    columns = np.asarray(first[:, 0, :, 0]).argmax(1)
-    assert set(columns.tolist()) == set(range(5))
-    for i in range(8):
-        np.testing.assert_array_equal(np.asarray(pictures[:, i, i + 1, :, 0]).argmax(1), columns)
-    assert np.all(np.asarray(first).sum((1, 2, 3)) == 2 * 255)
+def play(column: int, actions: list[int]) -> tuple[list[np.ndarray], list[float], list[bool]]:
+    """Pictures, rewards and ends of one episode by NumPy alone."""
+    paddle, pictures, rewards, ends = 2, [], [], []
+    for row, action in enumerate(actions, 1):
+        paddle = min(4, max(0, paddle + action - 1))
+        board = np.zeros((10, 5), np.uint8)
+        board[row, column] = board[9, paddle] = 255
+        pictures.append(board[..., None])
+        rewards.append(0.0 if row < 9 else 1.0 if paddle == column else -1.0)
+        ends.append(row == 9)
+    return pictures, rewards, ends
 
 
-def test_a_board_that_is_too_low_is_refused():
-    with pytest.raises(ValueError, match="2 rows and 7 columns"):
-        Catch(2, 7)
+@pytest.mark.parametrize("column", range(5))
+def test_steps_are_those_played_by_hand(column):
+    actions = np.random.default_rng(column).integers(0, 3, (20, 9))
+    state = CatchState(*(jnp.asarray(x, jnp.int32) for x in (0, column, 2)))
+    episode = lambda a: jax.lax.scan(lambda s, a: Catch().step(s, a, KEY), state, a)[1]  # noqa: E731
+    found = jax.device_get(jit(jax.vmap(episode))(jnp.asarray(actions)))
+    for i, sequence in enumerate(actions.tolist()):
+        pictures, rewards, ends = play(column, sequence)
+        np.testing.assert_array_equal(found.observation[i], np.stack(pictures))
+        assert found.reward[i].tolist() == rewards and found.terminated[i].tolist() == ends
+        assert not found.truncated.any()
+
+
+def test_the_best_policy_never_misses_and_chance_is_as_computed(item):
+    """Optimum 1, from every column. At random the paddle meets the ball with chance 1/5: its column does not depend on any move."""
+    random_return = 2 / 5 - 1
+
+    def episode(key: jax.Array, wise: bool) -> jax.Array:
+        state, _ = Catch().reset(key)
+
+        def step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            action = 1 + jnp.sign(state.column - state.paddle) if wise else jax.random.randint(key, (), 0, 3)
+            state, timestep = Catch().step(state, action, key)
+            return state, timestep.reward
+
+        return jax.lax.scan(step, state, jax.random.split(key, 9))[1].sum()
+
+    keys = jax.random.split(KEY, 4000)
+    best, worst = (jit(jax.vmap(lambda k, w=w: episode(k, w)))(keys) for w in (True, False))
+    with item("6.6") as check:
+        check(float(best.min()), "==", 1.0, "Catch: return of the best policy, the worst of 4000 episodes")
+        check(
+            abs(float(worst.mean()) - random_return), "<=", 0.05, "Catch: return at random beside -0.6 by enumeration"
+        )
+    assert random_return == pytest.approx(-0.6)
+
+
+@pytest.mark.parametrize("memory", [rtg.UniformReplay, rtg.PrioritisedReplay])
+def test_learning_from_pictures_stored_once_is_learning_from_all_of_them(memory, item):
+    """The same bits in the network after twenty updates, through the seam of the ring."""
+    env = rtg.vectorize(FrameStack(Catch(5, 3), 3), 4)
+    learner = rtg.DQN(network=rtg.CNN((2,), (3,), (1,), (4,)), epsilon=0.3, target_period=3)
+    found = []
+    for frames in (3, 0):
+        loop = rtg.OffPolicy(env, learner, memory(96, frames=frames), unroll=4, warm_up=64, batch_size=16)
+        loop = loop.with_horizon(20)
+        many = lambda key, loop=loop: jax.lax.fori_loop(  # noqa: E731
+            0, 20, lambda i, s: loop.step(s, jax.random.fold_in(key, i))[0], loop.init(key)
+        )
+        found.append(jax.device_get(jit(many)(KEY)))
+    once, whole = (jax.tree.leaves(s.learner) for s in found)
+    gaps = [np.abs(np.float64(a) - np.float64(b)).max() for a, b in zip(once, whole, strict=True)]
+    with item("6.2") as check:
+        check(max(gaps), "==", 0.0, f"parameters after 20 updates, frames once or whole, {memory.__name__}")
+    assert int(found[0].learner.updates) == 20 and np.isfinite(once[0]).all()
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 5), (10, 0)])
+def test_boards_without_room_are_refused(rows, columns):
+    with pytest.raises(ValueError, match="at least 2 rows and 1 column"):
+        Catch(rows, columns)

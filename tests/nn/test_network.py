@@ -8,6 +8,7 @@ import pytest
 from algorithms_under_test import first_gradient, jit
 from rewardtogo.core import from_space
 from rewardtogo.nn import CNN, GRU, LSTM, MLP, Custom, Linear, Optimiser, as_network, flatten_observation, global_norm
+from rewardtogo.nn.network import _convolve
 
 KEY = jax.random.key(0)
 VECTOR = from_space(spaces.Box(-1, 1, (3,), np.float32))
@@ -182,3 +183,30 @@ def test_adam_clips_by_the_global_norm():
 
 def test_global_norm_of_nothing_is_zero():
     assert global_norm({"a": jnp.zeros(0)}) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("shape", "kernel", "stride"),
+    [((84, 84, 4), 8, 4), ((10, 5, 1), 3, 1), ((11, 9, 2), 3, 2), ((9, 8, 3), 2, 3), ((7, 7, 1), 7, 5)],
+)
+def test_a_convolution_is_that_of_xla(shape, kernel, stride):
+    """Kernels that are whole cells and such that are not, pictures with rows to spare and without; gradients too."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    x = jax.random.normal(keys[0], shape)
+    layer = Linear(jax.random.normal(keys[1], (5, kernel * kernel * shape[-1])), jax.random.normal(keys[2], (5,)))
+
+    def theirs(x, layer):
+        filters = layer.weight.reshape(5, kernel, kernel, shape[-1]).transpose(1, 2, 3, 0)
+        numbers = ("NHWC", "HWIO", "NHWC")
+        y = jax.lax.conv_general_dilated(x[None], filters, (stride, stride), "VALID", dimension_numbers=numbers)[0]
+        return y + layer.bias[None, None]
+
+    def both(x, layer):
+        square = lambda f: lambda x, layer: (f(x, layer) ** 2).sum()  # noqa: E731
+        ours = lambda x, layer: _convolve(x, layer, stride)  # noqa: E731
+        return [(f(x, layer), jax.grad(square(f), (0, 1))(x, layer)) for f in (ours, theirs)]
+
+    a, b = jax.jit(both)(x, layer)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * float(jnp.abs(other).max()))

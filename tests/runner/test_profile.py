@@ -9,9 +9,9 @@ from rewardtogo.runner import profile as module
 from rewardtogo.runner.profile import Anatomy, anatomy, profile
 
 
-@pytest.mark.parametrize("name", ["ppo", "dqn"])
+@pytest.mark.parametrize("name", ["ppo", "dqn", "async_ac"])
 def test_the_parts_add_up(untrained, item, name):
-    loop = {"unroll": 32} if name == "ppo" else {"unroll": 8, "warm_up": 200, "batch_size": 128, "updates": 2}
+    loop = {"unroll": 8, "warm_up": 200, "batch_size": 128, "updates": 2} if name == "dqn" else {"unroll": 32}
     options = {"num_envs": 4, "loop": loop, "steps": 20_000}
     run = untrained(name, "CartPole-v1", checkpoint=True, options=options, network=MLP(64, 64))
     before = {p: p.stat().st_mtime_ns for p in run.rglob("*")}

@@ -26,6 +26,7 @@ from ..core import (
     Learner,
     Policy,
     PRNGKey,
+    Rollout,
     State,
     VectorEnv,
     env_spec,
@@ -43,6 +44,13 @@ class AsynchronousState(eqx.Module):
     acting: State
     fetched: Int[Array, "W"]
     updates: Int[Array, ""]
+
+
+class Delivery(eqx.Module):
+    """A rollout, and the worker that it comes from."""
+
+    rollout: Rollout
+    worker: Int[Array, ""]
 
 
 class Asynchronous(Algorithm, Configured):
@@ -97,23 +105,34 @@ class Asynchronous(Algorithm, Configured):
     def step(
         self, state: AsynchronousState, key: PRNGKey
     ) -> tuple[AsynchronousState, tuple[dict[str, jax.Array], Episodes]]:
-        choice_key, collect_key, update_key = jax.random.split(key, 3)
+        act_key, learn_key = jax.random.split(key)
+        state, delivery, episodes = self.act(state, act_key)
+        state, metrics = self.learn(state, delivery, learn_key)
+        return state, (metrics, episodes)
+
+    def act(self, state: AsynchronousState, key: PRNGKey) -> tuple[AsynchronousState, Delivery, Episodes]:
+        """The first half of an iteration: the next worker's rollout, with the parameters that it has."""
+        choice_key, collect_key = jax.random.split(key)
         if self.order == "in_turn":
             worker = state.updates % self.workers
         else:
             worker = jax.random.randint(choice_key, (), 0, self.workers)
         actor, policy = jax.tree.map(lambda x: x[worker], (state.actors, state.acting))
         actor, rollout, episodes = collect(self.env, policy, actor, collect_key, self.unroll)
-        learner, metrics, _ = self.learner.update(state.learner, rollout, update_key)
-        updates = state.updates + 1
-        fresh = self.learner.policy(learner, explore=True)
-        put = lambda all, one: all.at[worker].set(one)  # noqa: E731
-        actors, acting = jax.tree.map(put, (state.actors, state.acting), (actor, fresh))
+        actors = jax.tree.map(lambda all, one: all.at[worker].set(one), state.actors, actor)
+        return dataclasses.replace(state, actors=actors), Delivery(rollout, worker), episodes
+
+    def learn(
+        self, state: AsynchronousState, delivery: Delivery, key: PRNGKey
+    ) -> tuple[AsynchronousState, dict[str, jax.Array]]:
+        """The second half: the server learns from it, and the worker fetches the new parameters."""
+        worker = delivery.worker
+        learner, metrics, _ = self.learner.update(state.learner, delivery.rollout, key)
+        updates, fresh = state.updates + 1, self.learner.policy(learner, explore=True)
+        acting = jax.tree.map(lambda all, one: all.at[worker].set(one), state.acting, fresh)
         metrics = metrics | {"lag": (state.updates - state.fetched[worker]).astype(jnp.float32)}
-        return (
-            AsynchronousState(learner, actors, acting, state.fetched.at[worker].set(updates), updates),
-            (metrics, episodes),
-        )
+        fetched = state.fetched.at[worker].set(updates)
+        return AsynchronousState(learner, state.actors, acting, fetched, updates), metrics
 
     def learned(self, state: AsynchronousState) -> State:
         return state.learner

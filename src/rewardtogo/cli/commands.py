@@ -10,14 +10,14 @@ from typing import Any
 
 import jax
 
-from ..catalogue import LOOPS, algorithm_row
+from ..catalogue import LOOPS, algorithm_row, nearest
 from ..core import Schedule
 from ..envs.gymnasium import EnvironmentFailure
 from ..ops.schedules import to_text
-from ..runner.config import PARTS, merge, options, resolve
+from ..runner.config import PARTS, merge, options, part_of, resolve
 from ..runner.engine import NonFinite
 from ..runner.train import Interrupted, Run, resume, train
-from .main import INTERRUPTED, WRONG, RequestError, _say
+from .main import INTERRUPTED, SOLVERS, WRONG, RequestError, _say
 
 
 def cache_folder() -> Path:
@@ -281,6 +281,35 @@ def _figure(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> Non
     print(draw(given.id, given.out, given.seed))
 
 
+def _solve(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    from ..runner.solve import report, solve_by_name
+
+    if given.method not in SOLVERS:
+        raise ValueError(f"there is no method {given.method!r}: {nearest(given.method, SOLVERS)}")
+    if given.out:
+        from ..runner.plot import picture_file
+
+        picture_file(given.out)
+    found = solve_by_name(
+        given.env,
+        given.method,
+        gamma=given.gamma,
+        tolerance=given.tolerance,
+        horizon=given.horizon,
+        **{k: _value(v) for k, v in groups["env"].items()},
+    )
+    if given.json:
+        print(json.dumps(found.to_json()))
+    else:
+        encoding = sys.stdout.encoding or "ascii"
+        text = report(found, arrows=True)
+        print(text if text.encode(encoding, "replace").decode(encoding) == text else report(found, arrows=False))
+    if given.out:
+        from ..runner.draw_solution import draw_solution
+
+        print(draw_solution(found, given.out), file=sys.stderr if given.json else sys.stdout)
+
+
 def show_options(algorithm: str) -> None:
     """Print every hyperparameter of an algorithm and of its loop: default, range, meaning."""
     row = None if ":" in algorithm else algorithm_row(algorithm)
@@ -296,15 +325,20 @@ def show_options(algorithm: str) -> None:
                 f"  --{title}.{name.replace('_', '-')} {_shown(settings.get(name, field.default))}{limits}\n      {field.metadata['doc']}"
             )
             if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
-                for inner in options(type(field.default)):
+                chosen = part_of(name, field, settings.get(name, field.default))
+                for inner in options(type(chosen)):
                     print(
-                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(field.default, inner))}"
+                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(chosen, inner))}"
                     )
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, Schedule):
         return to_text(value)
+    if isinstance(value, dict):  # a part, of which some options are set
+        return " ".join(
+            [*([value["class"]] if "class" in value else []), *(f"{k} {v}" for k, v in value.items() if k != "class")]
+        )
     if isinstance(value, tuple):
         return " ".join(map(str, value))
     if dataclasses.is_dataclass(value):
@@ -323,4 +357,5 @@ COMMANDS = {
     "collect": _collect,
     "export": _export,
     "figure": _figure,
+    "solve": _solve,
 }

@@ -13,6 +13,14 @@ from ..catalogue import ALGORITHMS, ENVIRONMENTS, nearest
 INTERRUPTED, WRONG = 130, 2
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 MOST_EPISODES = 1_000_000
+SOLVERS = (
+    "value_iteration",
+    "policy_iteration",
+    "modified_policy_iteration",
+    "gauss_seidel",
+    "prioritised_sweeping",
+    "backward_induction",
+)
 
 
 class RequestError(Exception):
@@ -184,6 +192,29 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument("--format", default="stablehlo", help="stablehlo or onnx")
     p.add_argument("--out", metavar="FILE", help="default RUN/policy.FORMAT")
     p.add_argument("--checkpoint", default="last", metavar="best|last")
+    p = command("solve", "solve an environment with a known table of transitions by dynamic programming")
+    p.add_argument(
+        "env",
+        metavar="ENV",
+        help="such as FrozenLake-v1, CliffWalking-v1 or Taxi-v4; --env.KEY V are its arguments",
+    )
+    p.add_argument("--method", default="value_iteration", metavar="METHOD", help="; ".join(SOLVERS))
+    p.add_argument("--gamma", type=_number, default=1.0, metavar="G", help="discount (default 1: the plain return)")
+    p.add_argument(
+        "--tolerance",
+        type=_number,
+        default=1e-10,
+        metavar="E",
+        help="how far from optimal is good enough (default 1e-10)",
+    )
+    p.add_argument(
+        "--horizon",
+        type=_whole,
+        metavar="T",
+        help="actions in an episode, for backward_induction (default: the time limit)",
+    )
+    p.add_argument("--out", metavar="FILE.png|.svg", help="also draw the values and the policy")
+    p.add_argument("--json", action="store_true")
     p = command("figure", "redraw a figure or experiment of the notes")
     p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
     p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
@@ -191,7 +222,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     return main, table
 
 
-def _nested(pairs: Sequence[str], groups: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def _nested(pairs: Sequence[str], groups: tuple[str, ...], command: str = "train") -> dict[str, dict[str, Any]]:
     """`--learner.network.sizes 64 64 --env.x 1` as nested dictionaries by group."""
     found: dict[str, dict[str, Any]] = {group: {} for group in groups}
     i = 0
@@ -202,10 +233,15 @@ def _nested(pairs: Sequence[str], groups: tuple[str, ...]) -> dict[str, dict[str
         if not word.startswith("--"):
             raise RequestError(f"what is {word!r} for? Options are written --name value; see --help")
         if steps[0] not in groups or len(steps) < 2:
-            known = [a for action in _parsers()[1]["train"]._actions for a in action.option_strings]
+            known = [a for action in _parsers()[1][command]._actions for a in action.option_strings]
+            hint = (
+                "Options of the algorithm are --learner.NAME"
+                if "learner" in groups
+                else "The environment's are --env.NAME"
+            )
             raise RequestError(
                 f"there is no option {word.partition('=')[0]!r}: "
-                f"{nearest(word, [*known, '--learner.NAME', '--loop.NAME', '--env.NAME'])} Options of the algorithm are --learner.NAME"
+                f"{nearest(word, [*known, *(f'--{group}.NAME' for group in groups)])} {hint}"
             )
         i += 1
         values = [value] if equals else []
@@ -273,6 +309,9 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
             return 0
         options, rest = table["train"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("learner", "loop", "env"))
+    elif arguments[0] == "solve" and not any(a in ("-h", "--help") for a in arguments):
+        options, rest = table["solve"].parse_known_args(arguments[1:])
+        groups = _nested(rest, ("env",), "solve")
     else:
         options = _known(table[arguments[0]], arguments[1:])
     options.arguments = arguments

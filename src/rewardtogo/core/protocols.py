@@ -10,6 +10,7 @@ from typing import Any, Literal
 import equinox as eqx
 import gymnasium.spaces as spaces
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from .fields import Configured
@@ -134,7 +135,9 @@ class Learner(Configured):
 
     @abstractmethod
     def update(self, state: State, batch: Any, key: PRNGKey) -> tuple[State, dict[str, Array], Array | tuple[()]]:
-        """Learn from a `Rollout` or a `Batch`: new state, scalar metrics, and priorities by sample (or `()`)."""
+        """Learn from a `Rollout` or a `Batch`: new state, scalar metrics, and priorities by sample, `[N]` or of each step `[T, N]`
+        (or `()`).
+        """
 
 
 class Algorithm(eqx.Module):
@@ -180,8 +183,8 @@ class Solution(eqx.Module):
     """What a solver returns: the answer, whether and why it stopped, and how it went."""
 
     value: State
-    converged: Bool[Array, "..."]
-    stats: dict[str, Array]
+    converged: Bool[Array | np.ndarray, "..."]
+    stats: dict[str, Any]
 
 
 def env_spec(env: Environment | VectorEnv) -> EnvSpec:

@@ -10,6 +10,8 @@ from .minari import to_minari as to_minari
 from .n_step import n_step as n_step
 from .n_step import n_step_windows as n_step_windows
 from .noise import perturb as perturb
+from .prioritised import PrioritisedReplay as PrioritisedReplay
+from .replay import Replay as Replay
 from .replay import ReplayState as ReplayState
 from .replay import UniformReplay as UniformReplay
 from .trajectories import Trajectory as Trajectory

@@ -2,6 +2,7 @@
 
 from .acrobot import Acrobot as Acrobot
 from .cartpole import CartPole as CartPole
+from .catch import Catch as Catch
 from .check import check_env as check_env
 from .gymnasium import EnvironmentFailure as EnvironmentFailure
 from .gymnasium import GymnasiumEnv as GymnasiumEnv
@@ -18,6 +19,7 @@ from .tabular import MDP as MDP
 from .tabular import POMDP as POMDP
 from .tabular import TabularEnv as TabularEnv
 from .tabular import TabularModel as TabularModel
+from .time_limit import FiniteHorizon as FiniteHorizon
 from .time_limit import TimeLimit as TimeLimit
 from .vectorize import Vectorized as Vectorized
 from .vectorize import vectorize as vectorize

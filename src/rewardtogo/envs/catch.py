@@ -1,8 +1,12 @@
-"""Catch: the smallest game of pictures (Mnih et al. 2014; bsuite, Osband et al. 2020). A ball falls, a paddle below moves; did it catch it?
+"""Catch (Mnih, Heess, Graves and Kavukcuoglu 2014): a game of pictures so small that it is learnt in seconds, whose optimum is known.
 
-The board is `rows` x `columns` grey pixels, ball and paddle white. Each step the ball falls a row, and the paddle moves left (0), stays
-(1) or moves right (2). When the ball reaches the last row the episode ends, with reward 1 if the paddle is there and -1 if not. The
-optimum is 1: from anywhere in the middle there is time.
+A ball falls from a random column, one row a step; a paddle in the bottom row moves left, stays, or moves right. When the ball reaches the
+bottom row the episode terminates with reward 1 where it meets the paddle and -1 where it does not. All other rewards are 0, so that the
+move that decided comes steps before what it earned.
+
+The observation is the board as an 8-bit picture `[rows, columns, 1]`, ball and paddle 255, everything else 0, and shows the whole state:
+the ball falls straight. With at least as many steps as the paddle has to go the best policy never misses: its return is 1 and its value
+gamma to the number of steps that are left, less one.
 """
 
 import equinox as eqx
@@ -10,13 +14,13 @@ import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, UInt8
 
-from ..core import Environment, PRNGKey, Timestep
+from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
 
 
 class CatchState(eqx.Module):
-    """Row and column of the ball, column of the paddle."""
+    """Where the ball is, and the column of the paddle."""
 
     row: Int[Array, ""]
     column: Int[Array, ""]
@@ -24,16 +28,15 @@ class CatchState(eqx.Module):
 
 
 class Catch(Environment):
-    """The game, on a board of a size that can be chosen."""
+    """A board of `rows` by `columns`. Actions: 0 left, 1 stay, 2 right."""
 
-    rows: int = eqx.field(static=True, default=10)
-    columns: int = eqx.field(static=True, default=5)
+    rows: int = eqx.field(default=10, static=True)
+    columns: int = eqx.field(default=5, static=True)
 
     def __check_init__(self) -> None:
-        if self.columns < 1 or self.rows - 1 < self.columns // 2:
+        if self.rows < 2 or self.columns < 1:
             raise ValueError(
-                f"on a board of {self.rows} rows and {self.columns} columns the paddle cannot always be in time: it moves a column a row, "
-                "and starts in the middle; give at least 1 + columns / 2 rows"
+                f"Catch needs at least 2 rows and 1 column for a ball to fall, not {self.rows} and {self.columns}"
             )
 
     @property
@@ -44,20 +47,20 @@ class Catch(Environment):
     def action_space(self) -> spaces.Discrete:
         return spaces.Discrete(3)
 
-    def reset(self, key: PRNGKey) -> tuple[CatchState, Array]:
+    def reset(self, key: PRNGKey) -> tuple[State, Observation]:
         column = jax.random.randint(key, (), 0, self.columns)
         state = CatchState(jnp.zeros((), jnp.int32), column, jnp.asarray(self.columns // 2, jnp.int32))
-        return state, self._draw(state)
+        return state, self._picture(state)
 
-    def step(self, state: CatchState, action: Int[Array, ""], key: PRNGKey) -> tuple[CatchState, Timestep]:
+    def step(self, state: CatchState, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key
-        paddle = jnp.clip(state.paddle + action - 1, 0, self.columns - 1).astype(jnp.int32)
+        paddle = jnp.clip(state.paddle + jnp.asarray(action, jnp.int32) - 1, 0, self.columns - 1)
         state = CatchState(state.row + 1, state.column, paddle)
-        down = state.row >= self.rows - 1
-        reward = jnp.where(down, jnp.where(paddle == state.column, 1.0, -1.0), 0.0)
-        picture = self._draw(state)
+        down = state.row == self.rows - 1
+        reward = jnp.where(down, jnp.where(state.column == paddle, 1.0, -1.0), 0.0)
+        picture = self._picture(state)
         return state, Timestep(picture, reward, down, jnp.zeros((), bool), picture, {})
 
-    def _draw(self, state: CatchState) -> Array:
+    def _picture(self, state: CatchState) -> UInt8[Array, "H W 1"]:
         board = jnp.zeros((self.rows, self.columns, 1), jnp.uint8)
-        return board.at[self.rows - 1, state.paddle].set(255).at[state.row, state.column].set(255)
+        return board.at[state.row, state.column, 0].set(255).at[self.rows - 1, state.paddle, 0].set(255)

@@ -8,6 +8,7 @@ import gymnasium
 from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
+from .atari import PREFIX, RAW_REWARD, Atari
 from .cartpole import CartPole
 from .catch import Catch
 from .envpool import EnvPool
@@ -15,14 +16,16 @@ from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
 from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
+from .reward_wrappers import NormalizeReward
 from .time_limit import TimeLimit
+from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
 from .wrappers import MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
 
-COMPILED: dict[str, Callable[[], Environment]] = {
+COMPILED: dict[str, Callable[..., Environment]] = {
     "CartPole-v1": lambda: TimeLimit(CartPole(), 500),
     "CartPoleNoVel-v1": lambda: TimeLimit(MaskObservation(CartPole(), keep=(0, 2)), 500),
     "Acrobot-v1": lambda: TimeLimit(Acrobot(), 500),
@@ -30,15 +33,24 @@ COMPILED: dict[str, Callable[[], Environment]] = {
     "MountainCarContinuous-v0": lambda: TimeLimit(MountainCarContinuous(), 999),
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
+    "Catch": Catch,
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,
-    "Catch": Catch,
+    # The default argument holds the name: a loop's variable would be the last one in all of them.
+    **{name: (lambda name=name, **kwargs: toy_text(name, **kwargs)) for name in TABULAR},
 }
 """Environments that run inside the compiled program, by name; those with a Gymnasium id are twins of Gymnasium's own."""
 
 
-def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **kwargs: Any) -> VectorEnv:
+def make(
+    env: Any,
+    num_envs: int | None = None,
+    *,
+    backend: Backend = "auto",
+    normalise_reward: float | None = None,
+    **kwargs: Any,
+) -> VectorEnv:
     """B environments side by side.
 
     - `env`: a Gymnasium id (`module:Id` included), one of ours (`rtg list --envs`), a function that makes an environment, a
@@ -46,10 +58,19 @@ def make(env: Any, num_envs: int | None = None, *, backend: Backend = "auto", **
     - `num_envs`: B, 1 if not given.
     - `backend`: `"jax"` for the compiled twin, `"gymnasium"` for Gymnasium's own, `"envpool"` for EnvPool's (extra
       `envpool`), `"auto"` for the twin where there is one, else Gymnasium's.
-    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own.
+    - `normalise_reward`: a discount in [0, 1]; rewards are then divided by the running standard deviation of the sums that they
+      make with it (`NormalizeReward`). Returns that are reported stay the environment's own.
+    - `kwargs`: go to `gymnasium.make` or `envpool.make`; an environment with arguments is Gymnasium's own, but for the toy environments,
+      whose twins are made from their tables.
 
     Raises `ValueError` for names nobody knows, with the nearest, and for backends that do not have the environment.
     """
+    if normalise_reward is not None:
+        if isinstance(normalise_reward, bool) or not isinstance(normalise_reward, (int, float)):
+            raise ValueError(
+                f"normalise_reward is a discount, a number in [0, 1] such as 0.99, not {normalise_reward!r}"
+            )
+        return NormalizeReward(make(env, num_envs, backend=backend, **kwargs), float(normalise_reward))
     if backend not in BACKENDS:
         raise ValueError(f"there is no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if isinstance(env, VectorEnv):
@@ -78,8 +99,10 @@ def _by_name(name: str, num_envs: int, backend: Backend, kwargs: dict[str, Any])
         raise ValueError(f"there must be at least one environment, not {num_envs}")
     if backend == "envpool":
         return GymnasiumEnv(EnvPool(name, num_envs, kwargs))
-    if name in COMPILED and backend != "gymnasium" and not kwargs:
-        return vectorize(COMPILED[name](), num_envs)
+    if name.startswith(PREFIX) and backend != "jax":
+        return GymnasiumEnv(Atari(name, num_envs, kwargs), extras=(RAW_REWARD,))
+    if name in COMPILED and backend != "gymnasium" and (not kwargs or has_twin(name, kwargs)):
+        return vectorize(COMPILED[name](**kwargs), num_envs)
     if name in COMPILED and kwargs and (backend == "jax" or name not in gymnasium.registry):
         raise ValueError(
             f"the compiled {name} takes no arguments, and was given {', '.join(kwargs)}: use --backend gymnasium or leave them out"

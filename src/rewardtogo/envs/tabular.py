@@ -25,7 +25,7 @@ from ..core import Environment, Model, PRNGKey, Timestep
 Table = Array | np.ndarray | Sequence
 
 
-def _as_floats(values: Table) -> np.ndarray:
+def as_floats(values: Table) -> np.ndarray:
     """As NumPy in the precision given: float32 stays float32, everything else becomes float64."""
     array = np.array(values)
     return array if array.dtype == np.float32 else array.astype(np.float64)
@@ -92,7 +92,7 @@ class MDP(eqx.Module):
         terminal: Table | None = None,
         horizon: int | None = None,
     ) -> None:
-        self.transitions = _as_floats(transitions)
+        self.transitions = as_floats(transitions)
         if (
             self.transitions.ndim != 3
             or self.transitions.shape[0] != self.transitions.shape[2]
@@ -108,7 +108,7 @@ class MDP(eqx.Module):
             raise ValueError(
                 f"terminal has shape {self.terminal.shape} for {states} states: give one flag for each state"
             )
-        given = _as_floats(rewards)
+        given = as_floats(rewards)
         if given.shape not in ((states, actions), (states, actions, states)):
             raise ValueError(
                 f"rewards has shape {given.shape} and the transitions want [{states}, {actions}] or "
@@ -122,15 +122,14 @@ class MDP(eqx.Module):
         given[self.terminal] = 0
         self.outcome_rewards = given if given.ndim == 3 else None
         self.rewards = given if given.ndim == 2 else (self.transitions * given).sum(-1)
-        self.initial = _initial(initial, self.terminal)
+        self.initial = initial_distribution(initial, self.terminal)
         self.discount = np.asarray(discount, np.float64)
         self.horizon = horizon
         check_distributions("transitions", self.transitions)
         self._check_ends()
 
     def _check_ends(self) -> None:
-        if self.discount.ndim or not 0 <= self.discount <= 1:
-            raise ValueError(f"discount is {self.discount} and must be one number in [0, 1]")
+        check_discount(self.discount)
         if self.horizon is not None and (type(self.horizon) is not int or self.horizon < 1):
             raise ValueError(
                 f"horizon is {self.horizon} and must be a number of actions, at least 1, or None for no end"
@@ -160,12 +159,22 @@ class MDP(eqx.Module):
         return self.transitions * (1 - self.terminal.astype(self.transitions.dtype))[None, None]
 
 
-def _initial(initial: Table | int, terminal: np.ndarray) -> np.ndarray:
+def check_discount(discount: np.ndarray | Array) -> None:
+    """Raise `ValueError` unless it is one number in [0, 1]."""
+    if discount.ndim or not 0 <= discount <= 1:
+        raise ValueError(f"discount is {discount} and must be one number in [0, 1]")
+
+
+def initial_distribution(initial: Table | int, terminal: np.ndarray) -> np.ndarray:
+    """p_0 from probabilities, or from the one state that episodes start in; nothing starts in a terminal state."""
     states = len(terminal)
     if isinstance(initial, (int, np.integer)):
         if not 0 <= initial < states:
             raise ValueError(f"initial is state {initial} and there are {states}: give a state from 0 to {states - 1}")
-    start = np.eye(states)[initial] if isinstance(initial, (int, np.integer)) else _as_floats(initial)
+        start = np.zeros(states)
+        start[initial] = 1.0
+    else:
+        start = as_floats(initial)
     if start.shape != (states,):
         raise ValueError(f"initial has shape {start.shape} for {states} states: give one probability for each state")
     check_distributions("initial", start)
@@ -189,7 +198,7 @@ class POMDP(eqx.Module):
 
     def __init__(self, mdp: MDP, emissions: Table) -> None:
         self.mdp = mdp
-        self.emissions = _as_floats(emissions)
+        self.emissions = as_floats(emissions)
         if self.emissions.ndim != 2 or len(self.emissions) != mdp.num_states or not self.emissions.size:
             raise ValueError(
                 f"emissions has shape {self.emissions.shape} for {mdp.num_states} states: "
@@ -203,7 +212,7 @@ class POMDP(eqx.Module):
         return self.emissions.shape[-1]
 
 
-def _cumulative(probabilities: Array | np.ndarray) -> Array:
+def cumulative(probabilities: Array | np.ndarray) -> Array:
     """Running sums, added up in the precision given and kept in float32, for `draw`."""
     return jnp.asarray(probabilities.cumsum(-1), jnp.float32)
 
@@ -238,9 +247,9 @@ class TabularEnv(Environment):
 
     def __init__(self, problem: MDP | POMDP) -> None:
         self.problem = problem
-        self.start_table = _cumulative(self.mdp.initial)
-        self.next_table = _cumulative(self.mdp.transitions)
-        self.emission_table = _cumulative(problem.emissions) if isinstance(problem, POMDP) else None
+        self.start_table = cumulative(self.mdp.initial)
+        self.next_table = cumulative(self.mdp.transitions)
+        self.emission_table = cumulative(problem.emissions) if isinstance(problem, POMDP) else None
 
     @property
     def mdp(self) -> MDP:
@@ -296,7 +305,7 @@ class TabularModel(Model):
 
     def __init__(self, mdp: MDP) -> None:
         self.mdp = mdp
-        self.next_table = _cumulative(mdp.transitions)
+        self.next_table = cumulative(mdp.transitions)
 
     def encode(self, observation: Int[Array, ""]) -> Int[Array, ""]:
         return jnp.asarray(observation, jnp.int32)

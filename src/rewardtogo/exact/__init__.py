@@ -12,7 +12,9 @@ from .chains import state_distributions as state_distributions
 from .chains import stationary_distribution as stationary_distribution
 from .dynamic_programming import discounted_system as discounted_system
 from .dynamic_programming import expected_return as expected_return
+from .dynamic_programming import first_actions as first_actions
 from .dynamic_programming import horizon_of as horizon_of
+from .dynamic_programming import improve_until_stable as improve_until_stable
 from .dynamic_programming import induced_chain as induced_chain
 from .dynamic_programming import optimal_policy as optimal_policy
 from .dynamic_programming import optimal_q_values as optimal_q_values

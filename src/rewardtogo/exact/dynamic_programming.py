@@ -10,8 +10,10 @@ V = E_a[Q] is the law of total expectation, and J = E_{s_0 ~ p_0}[V(s_0)] is an 
 Source: notes, section 1.2.
 """
 
+from collections.abc import Callable
+
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..envs.tabular import MDP, can_end
 from .policies import check_policy, greedy_policy
@@ -108,20 +110,38 @@ def optimal_policy(mdp: MDP, horizon: int | None = None) -> Float[np.ndarray, ".
 
 
 def _policy_iteration(mdp: MDP) -> Float[np.ndarray, "S A"]:
-    """Policy iteration that changes an action only for a real gain.
+    start = first_actions(mdp)
+    return np.eye(mdp.num_actions)[improve_until_stable(lambda a: q_values(mdp, np.eye(mdp.num_actions)[a]), start)[0]]
+
+
+def improve_until_stable(
+    evaluate: Callable[[Int[np.ndarray, "S"]], Float[np.ndarray, "S A"]],
+    actions: Int[np.ndarray, "S"],
+    tolerance: float = 1e-13,
+) -> tuple[Int[np.ndarray, "S"], list[Float[np.ndarray, "S"]]]:
+    """Policy iteration that changes an action only for a real gain: the last policy, and the values of each one on the way.
+
+    - `evaluate`: Q^π of a deterministic policy.
+    - `tolerance`: what counts as a gain, relative to the largest |Q|.
 
     With discount 1 that matters: from a policy that ends it then leads to policies that end, unless some loop has a
     positive reward. The sum of the values rises strictly, so rounding cannot make it go in circles.
     """
-    states, total = np.arange(mdp.num_states), -np.inf
-    actions = best = _ending_actions(mdp) if mdp.discount == 1 else np.asarray(mdp.rewards).argmax(-1)
+    states, total, path = np.arange(len(actions)), -np.inf, []
+    best = actions
     while True:
-        q = q_values(mdp, np.eye(mdp.num_actions)[actions])
+        q = evaluate(actions)
         held = q[states, actions]
         if held.sum() <= total:
-            return np.eye(mdp.num_actions)[best]
+            return best, path
+        path.append(held)
         total, best = held.sum(), actions
-        actions = np.where(q.max(-1) > held + 1e-13 * np.abs(q).max(initial=1.0), q.argmax(-1), actions)
+        actions = np.where(q.max(-1) > held + tolerance * np.abs(q).max(initial=1.0), q.argmax(-1), actions)
+
+
+def first_actions(mdp: MDP) -> Int[np.ndarray, "S"]:
+    """A policy to begin policy iteration with, which has a value: greedy for rewards, or one that ends where the discount is 1."""
+    return _ending_actions(mdp) if mdp.discount == 1 else np.asarray(mdp.rewards).argmax(-1)
 
 
 def _ending_actions(mdp: MDP) -> np.ndarray:

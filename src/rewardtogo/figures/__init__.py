@@ -32,6 +32,11 @@ FIGURES = {
         "q_processes",
         "Q-learning in general: collecting, regressing and moving the target as processes with rates, of Algorithms 9 to 13",
     ),
+    "5.1": (
+        "bellman_projection",
+        "a Bellman backup and the projection after it in the plane of the values of two states, and where many of them lead",
+    ),
+    "divergences": ("divergences", "Baird's example and w, 2w: which methods diverge, and which do not"),
     "7.1": (
         "fisher_ellipse",
         "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",

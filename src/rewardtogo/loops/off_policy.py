@@ -15,6 +15,7 @@ from ..core import (
     Learner,
     Policy,
     PRNGKey,
+    Rollout,
     State,
     VectorEnv,
     env_spec,
@@ -22,7 +23,7 @@ from ..core import (
     part,
     setting,
 )
-from ..data.replay import ReplayState, UniformReplay
+from ..data.replay import Replay, ReplayState, UniformReplay
 from .collect import RandomPolicy, begin, collect
 
 
@@ -38,13 +39,14 @@ class OffPolicy(Algorithm, Configured):
     """Each iteration takes `unroll` steps in each environment and then learns from `updates` batches drawn from the replay.
 
     The first `warm_up` steps, inside `init`, are those of a uniformly random policy, or of the learner's own where it keeps the
-    probabilities of its actions. Raises `ValueError` where the learner wants
-    fresh rollouts, or where the replay cannot hold what is asked of it.
+    probabilities of its actions. What `update` says of each sample goes back to the replay, which may draw by it. Raises
+    `ValueError` where the learner wants fresh rollouts, where the replay cannot hold what is asked of it, or where it draws by what
+    the learner does not say.
     """
 
     env: VectorEnv
     learner: Learner
-    replay: UniformReplay = part(UniformReplay(), "the memory")
+    replay: Replay = part(UniformReplay(), "the memory")
     unroll: int = setting(4, "steps in each environment between two visits to the replay", at_least=1)
     updates: int = setting(1, "batches learnt from in each iteration", at_least=1)
     batch_size: int = setting(64, "transitions (or sequences) in a batch", at_least=1)
@@ -58,19 +60,19 @@ class OffPolicy(Algorithm, Configured):
             )
         if self._block < 1:
             return  # what is wrong with `unroll` is said by its own range
-        if self.replay.capacity < self._block:
+        if self.replay.size < self._block:
             raise ValueError(
-                f"a replay of {self.replay.capacity} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
+                f"a replay of {self.replay.size} transitions cannot hold one block of {self.unroll} steps in {self.env.num_envs} "
                 f"environments: give it a capacity of at least {self._block}"
             )
-        if self.replay.capacity < self.batch_size < 2**31:
+        if self.replay.size < self.batch_size < 2**31:
             raise ValueError(
-                f"a replay of {self.replay.capacity} transitions is smaller than a batch of {self.batch_size}, which would hold most of "
+                f"a replay of {self.replay.size} transitions is smaller than a batch of {self.batch_size}, which would hold most of "
                 f"them twice: give it a capacity of at least {self.batch_size}, or a smaller batch_size"
             )
-        if self._sequential and self.replay.capacity // self._block * self.unroll < self.length:
+        if self._sequential and self.replay.size // self._block * self.unroll < self.length:
             raise ValueError(
-                f"a replay of {self.replay.capacity} transitions holds no sequence of {self.length} steps: "
+                f"a replay of {self.replay.size} transitions holds no sequence of {self.length} steps: "
                 f"give it a capacity of at least {self.length * self.env.num_envs + self._block}"
             )
 
@@ -111,7 +113,9 @@ class OffPolicy(Algorithm, Configured):
         return drawn / self._block
 
     def with_horizon(self, iterations: int) -> "OffPolicy":
-        return dataclasses.replace(self, learner=fix_horizon(self.learner, iterations * self.updates))
+        horizon = iterations * self.updates
+        learner, replay = fix_horizon(self.learner, horizon), fix_horizon(self.replay, horizon)
+        return dataclasses.replace(self, learner=learner, replay=replay)
 
     def init(self, key: PRNGKey) -> OffPolicyState:
         learner_key, actor_key, warm_key = jax.random.split(key, 3)
@@ -122,7 +126,7 @@ class OffPolicy(Algorithm, Configured):
         _, example, _ = jax.eval_shape(
             lambda a, k: collect(self.env, policy, a, k, self.unroll, self._sequential), actor, keys[0]
         )
-        replay = self.replay.init(example.transitions, self.unroll)
+        replay = self.replay.init(example.transitions, self.unroll, self.length if self._sequential else 1)
         # Where probabilities are kept, they must be those of the actions taken: then the learner's own policy warms up.
         stochastic = "log_prob" in example.transitions.extras
         warm = policy if stochastic else _Carrying(RandomPolicy(self.spec), policy)
@@ -136,26 +140,52 @@ class OffPolicy(Algorithm, Configured):
         return OffPolicyState(learner, actor, replay)
 
     def step(self, state: OffPolicyState, key: PRNGKey) -> tuple[OffPolicyState, tuple[dict[str, jax.Array], Episodes]]:
-        collect_key, learn_key = jax.random.split(key)
+        act_key, learn_key = jax.random.split(key)
+        state, rollout, episodes = self.act(state, act_key)
+        state, metrics = self.learn(state, rollout, learn_key)
+        return state, (metrics, episodes)
+
+    def act(self, state: OffPolicyState, key: PRNGKey) -> tuple[OffPolicyState, Rollout, Episodes]:
+        """The first half of an iteration: steps in the environments."""
         policy = self.learner.policy(state.learner, explore=True)
-        actor, rollout, episodes = collect(self.env, policy, state.actor, collect_key, self.unroll, self._sequential)
+        actor, rollout, episodes = collect(self.env, policy, state.actor, key, self.unroll, self._sequential)
+        return OffPolicyState(state.learner, actor, state.replay), rollout, episodes
+
+    def learn(
+        self, state: OffPolicyState, rollout: Rollout, key: PRNGKey
+    ) -> tuple[OffPolicyState, dict[str, jax.Array]]:
+        """The second half: the steps go into the memory, and batches from there to the learner."""
         replay = self.replay.add(state.replay, rollout.transitions)
+        learner, replay, metrics = self._updates(state.learner, replay, key)
+        return OffPolicyState(learner, state.actor, replay), metrics
 
-        def update(learner: State, key: PRNGKey) -> tuple[State, dict[str, jax.Array]]:
-            sample_key, update_key = jax.random.split(key)
-            if self._sequential:
-                batch = self.replay.sample_sequences(replay, sample_key, self.batch_size, self.length)
-            else:
-                batch = self.replay.sample(replay, sample_key, self.batch_size)
-            learner, metrics, _ = self.learner.update(learner, batch, update_key)
-            return learner, metrics
-
+    def _updates(
+        self, learner: State, replay: ReplayState, key: PRNGKey
+    ) -> tuple[State, ReplayState, dict[str, jax.Array]]:
+        """The updates of one iteration: the learner, the replay, and the mean of the metrics."""
         if self.updates == 1:
-            learner, metrics = update(state.learner, learn_key)
+            return self._update(learner, replay, key)
+
+        def update(loop: tuple[State, State], key: PRNGKey) -> tuple[tuple[State, State], dict[str, jax.Array]]:
+            # Only the order is carried: what is stored does not change here.
+            learner, now, metrics = self._update(loop[0], dataclasses.replace(replay, order=loop[1]), key)
+            return (learner, now.order), metrics
+
+        keys = jax.random.split(key, self.updates)
+        (learner, order), metrics = jax.lax.scan(update, (learner, replay.order), keys)
+        return learner, dataclasses.replace(replay, order=order), jax.tree.map(jnp.mean, metrics)
+
+    def _update(
+        self, learner: State, replay: ReplayState, key: PRNGKey
+    ) -> tuple[State, ReplayState, dict[str, jax.Array]]:
+        """Draw a batch, learn from it, and tell the replay what came of it."""
+        sample_key, update_key = jax.random.split(key)
+        if self._sequential:
+            batch = self.replay.sample_sequences(replay, sample_key, self.batch_size, self.length)
         else:
-            learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(learn_key, self.updates))
-            metrics = jax.tree.map(jnp.mean, metrics)
-        return OffPolicyState(learner, actor, replay), (metrics, episodes)
+            batch = self.replay.sample(replay, sample_key, self.batch_size)
+        learner, metrics, feedback = self.learner.update(learner, batch, update_key)
+        return learner, self.replay.feedback(replay, batch, feedback), metrics
 
     def learned(self, state: OffPolicyState) -> State:
         return state.learner

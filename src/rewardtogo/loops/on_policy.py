@@ -14,6 +14,7 @@ from ..core import (
     Learner,
     Policy,
     PRNGKey,
+    Rollout,
     State,
     VectorEnv,
     env_spec,
@@ -78,11 +79,21 @@ class OnPolicy(Algorithm, Configured):
         return OnPolicyState(learner, begin(self.env, self.learner.policy(learner, explore=True), actor_key))
 
     def step(self, state: OnPolicyState, key: PRNGKey) -> tuple[OnPolicyState, tuple[dict[str, jax.Array], Episodes]]:
-        collect_key, update_key = jax.random.split(key)
+        act_key, learn_key = jax.random.split(key)
+        state, rollout, episodes = self.act(state, act_key)
+        state, metrics = self.learn(state, rollout, learn_key)
+        return state, (metrics, episodes)
+
+    def act(self, state: OnPolicyState, key: PRNGKey) -> tuple[OnPolicyState, Rollout, Episodes]:
+        """The first half of an iteration: a rollout of the current policy."""
         policy = self.learner.policy(state.learner, explore=True)
-        actor, rollout, episodes = collect(self.env, policy, state.actor, collect_key, self.unroll)
-        learner, metrics, _ = self.learner.update(state.learner, rollout, update_key)
-        return OnPolicyState(learner, actor), (metrics, episodes)
+        actor, rollout, episodes = collect(self.env, policy, state.actor, key, self.unroll)
+        return OnPolicyState(state.learner, actor), rollout, episodes
+
+    def learn(self, state: OnPolicyState, rollout: Rollout, key: PRNGKey) -> tuple[OnPolicyState, dict[str, jax.Array]]:
+        """The second half: one update from it."""
+        learner, metrics, _ = self.learner.update(state.learner, rollout, key)
+        return OnPolicyState(learner, state.actor), metrics
 
     def learned(self, state: OnPolicyState) -> State:
         return state.learner

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..core import Action, Carry, EnvSpec, Observation, Policy, PRNGKey, Rollout, Transition
 from ..ops.distributions import Categorical, DiagGaussian, Distribution
@@ -34,15 +34,21 @@ class ActorCritic(eqx.Module):
 
     @staticmethod
     def of(
-        network: Network, spec: EnvSpec, key: PRNGKey, *, shared: bool = False, detached: bool = False
+        network: Network,
+        spec: EnvSpec,
+        key: PRNGKey,
+        *,
+        shared: bool = False,
+        detached: bool = False,
+        log_std: ScalarLike = 0.0,
     ) -> "ActorCritic":
-        """Fresh parameters."""
+        """Fresh parameters. `log_std` is that of a Gaussian policy in units of half the box."""
         actor_key, head_key, critic_key, value_key = jax.random.split(key, 4)
         actor = network.build(spec.observation, actor_key)
         critic = None if shared else network.build(spec.observation, critic_key)
         return ActorCritic(
             actor,
-            ActionHead.of(actor.features, spec.action, head_key),
+            ActionHead.of(actor.features, spec.action, head_key, log_std=log_std),
             critic,
             Linear.of(actor.features, 1, value_key, gain=1.0),
             detached,

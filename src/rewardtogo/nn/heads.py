@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
 from ..core import PRNGKey, Spec
 from ..ops.distributions import Bernoulli, Categorical, DiagGaussian, Distribution, MultiCategorical
@@ -25,7 +25,7 @@ class ActionHead(eqx.Module):
     spec: Spec = eqx.field(static=True)
 
     @staticmethod
-    def of(features: int, spec: Spec, key: PRNGKey, gain: float = 0.01, log_std: float = 0.0) -> "ActionHead":
+    def of(features: int, spec: Spec, key: PRNGKey, gain: float = 0.01, log_std: ScalarLike = 0.0) -> "ActionHead":
         """A fresh head for actions of this kind. `log_std` is that of a Gaussian in units of half the box."""
         outputs = sum(spec.counts) if spec.counts else spec.size
         scale = half_width(spec)

@@ -76,6 +76,7 @@ class NPG(Learner):
     )
     max_grad_norm: Number = number(10.0, "gradients of the value loss are scaled down to this norm", above=0)
     normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
+    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
     @property
@@ -88,7 +89,7 @@ class NPG(Learner):
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> NPGState:
         require_action("NPG", spec, self.action_kinds)
-        network = ActorCritic.of(self.network, spec, key)
+        network = ActorCritic.of(self.network, spec, key, log_std=self.at(0).log_std)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
         return NPGState(network, self._optimiser().init(critic(network)), norm, jnp.zeros((), jnp.int32))
 

@@ -72,6 +72,7 @@ class OffPolicyPG(Learner):
     value_updates: int = setting(5, "gradient steps of the value regression on each batch", at_least=1)
     entropy_cost: Number = number(0.0, "weight of an entropy bonus", at_least=0)
     max_grad_norm: Number = number(1.0, "gradients are scaled down to this global norm", above=0)
+    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
     @property
@@ -84,7 +85,7 @@ class OffPolicyPG(Learner):
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> OffPolicyPGState:
         require_action("OffPolicyPG", spec, self.action_kinds)
-        network = ActorCritic.of(self.network, spec, key)
+        network = ActorCritic.of(self.network, spec, key, log_std=self.at(0).log_std)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
         optimiser = self._optimiser(self.learning_rate).init(network)
         return OffPolicyPGState(network, optimiser, optimiser, norm, jnp.zeros((), jnp.int32))

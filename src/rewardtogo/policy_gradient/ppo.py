@@ -89,6 +89,7 @@ class PPO(Learner):
         32, "steps that gradients flow back through a memory: rollouts are cut into such pieces", at_least=1
     )
     normalise_advantages: bool = setting(True, "mean 0, sd 1 in each minibatch")
+    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
     @property
@@ -101,7 +102,7 @@ class PPO(Learner):
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> PPOState:
         require_action("PPO", spec, self.action_kinds)
-        network = ActorCritic.of(self.network, spec, key)
+        network = ActorCritic.of(self.network, spec, key, log_std=self.at(0).log_std)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
         multiplier = jnp.asarray(self.at(0).multiplier, jnp.float32)
         return PPOState(network, self._optimiser().init(network), norm, multiplier, jnp.zeros((), jnp.int32))

@@ -112,6 +112,7 @@ class PolicyGradient(Learner):
     entropy_cost: Number = number(0.0, "weight of an entropy bonus", at_least=0)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
     normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
+    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
     def __check_init__(self) -> None:
@@ -149,7 +150,9 @@ class PolicyGradient(Learner):
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> PolicyGradientState:
         require_action("PolicyGradient", spec, self.action_kinds)
-        network = ActorCritic.of(self.network, spec, key, shared=self.shared, detached=self.detached)
+        network = ActorCritic.of(
+            self.network, spec, key, shared=self.shared, detached=self.detached, log_std=self.at(0).log_std
+        )
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
         optimiser = self._optimiser(self.learning_rate).init(network)
         return PolicyGradientState(network, optimiser, optimiser, norm, jnp.zeros((), jnp.int32))

@@ -16,16 +16,22 @@ import numpy as np
 
 from ..catalogue import nearest
 from ..core import Schedule
+from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
+from ..value.maximisers import CEM, Ascent, Sampled
+from ..value.noise import OU, Gaussian
 from ..value.outputs import C51, Expectation, Quantiles
 
 Module = TypeVar("Module")
 
-PARTS: dict[str, type] = {
-    c.__name__.lower(): c for c in (MLP, CNN, GRU, LSTM, UniformReplay, Expectation, C51, Quantiles)
-}
+_NETWORKS = (MLP, CNN, GRU, LSTM)
+_MEMORIES = (UniformReplay, PrioritisedReplay)
+_CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
+PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_MEMORIES, *_CHOICES)}
+PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 
 KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a name"}
@@ -115,7 +121,7 @@ def _value(cls: type, field: dataclasses.Field, value: Any) -> Any:
     where = f"{cls.__name__}.{field.name}"
     hint = _hint(cls, field)
     if field.metadata.get("part") or hint in (Network, Network | None):
-        return _part(where, field, value)
+        return part_of(where, field, value)
     if isinstance(value, dict):
         raise ValueError(f"{where} is one value and has no options of its own, such as {next(iter(value), '')!r}")
     if field.metadata.get("traced"):
@@ -145,16 +151,19 @@ def _hint(cls: type, field: dataclasses.Field) -> Any:
     return field.type if not isinstance(field.type, str) else typing.get_type_hints(cls)[field.name]
 
 
-def _part(where: str, field: dataclasses.Field, value: Any) -> Any:
+def part_of(where: str, field: dataclasses.Field, value: Any) -> Any:
+    """A part (a network, a replay) from plain data, or as it is. Raises `ValueError` for a class that it cannot be."""
     if isinstance(value, str):
         value = {"class": value}
     if not isinstance(value, dict):
         return value
     default = field.default if field.default is not dataclasses.MISSING else MLP(64)
     name = str(value.get("class", type(default).__name__)).lower()
-    if name not in PARTS:
+    kind = type(default).__mro__[1]  # what a part of another class must be too: a network, or a replay
+    known = [name for name, cls in PARTS.items() if issubclass(cls, kind)]
+    if name not in known:
         raise ValueError(
-            f"{where} cannot be a {value['class']!r} by name: {nearest(name, PARTS)} Others are given from Python."
+            f"{where} cannot be a {value['class']!r} by name: {nearest(name, known)} Others are given from Python."
         )
     base = describe(default) if PARTS[name] is type(default) else {}
     return build(PARTS[name], base | value)

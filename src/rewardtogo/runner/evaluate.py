@@ -12,9 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from ..core import Actor, Policy, VectorEnv, env_spec
+from ..core import Action, Actor, Algorithm, Carry, Observation, Policy, PRNGKey, State, VectorEnv, env_spec
 from ..envs.gymnasium import failure_of
 from ..loops.collect import begin, fresh_carry, reset_where
 
@@ -62,6 +62,34 @@ def _play(env: VectorEnv, policy: Policy, key: Array, quota: Array | int, rows: 
 
     start = (begin(env, policy, begin_key), Returns(table, table, jnp.zeros(lanes)), jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(going, body, start)[1]
+
+
+class Either(Policy):
+    """An algorithm's policy as it learns or as it is at its best, as `explore` says: one compiled program plays both.
+
+    Each keeps a memory of its own, since they may differ in kind (a noise that remembers its last value).
+    """
+
+    best: Policy
+    exploring: Policy
+    explore: Bool[Array, ""]
+
+    @staticmethod
+    def of(algorithm: Algorithm, state: State, explore: bool) -> "Either":
+        """The policies that a state holds."""
+        return Either(algorithm.policy(state, False), algorithm.policy(state, True), jnp.asarray(explore))
+
+    def init(self, key: PRNGKey) -> Carry:
+        return self.best.init(key), self.exploring.init(key)
+
+    def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
+        best_carry, best, _ = self.best(carry[0], observation, key)
+        exploring_carry, exploring, _ = self.exploring(carry[1], observation, key)
+        action = jax.tree.map(lambda x, y: jnp.where(self.explore, x, y), exploring, best)
+        return (best_carry, exploring_carry), action, {}
+
+    def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
+        return self.best.inspect(carry[0], observation)
 
 
 class Evaluator:

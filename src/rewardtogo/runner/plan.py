@@ -69,6 +69,7 @@ def plan(
     name = algorithm if isinstance(algorithm, str) else _name_of(algorithm)
     env_name = env if isinstance(env, str) else _title(env)
     ready = _preset(preset, name, env_name)
+    env_kwargs = merge(ready.get("env", {}), env_kwargs or {})
     check_budget(steps, seed)
     _check_num_envs(num_envs, env, backend, env_kwargs)
     if isinstance(algorithm, Algorithm):
@@ -94,7 +95,7 @@ def plan(
                     f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
                 )
             dataset = load_dataset(data) if isinstance(data, (str, Path)) else data
-            vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **env_kwargs)  # type: ignore[arg-type]
             if vector_env is not None:
                 require_spec(dataset.spec, env_spec(vector_env), "the data")
             whole = build(cls, options, dataset=dataset, learner=inner)
@@ -106,7 +107,7 @@ def plan(
                 if num_envs is not None or not isinstance(env, (str, Environment))
                 else ready.get("num_envs", (row and row.num_envs) or cls.default_num_envs())
             )
-            vector_env = make(env, number, backend=backend, **(env_kwargs or {}))  # type: ignore[arg-type]
+            vector_env = make(env, number, backend=backend, **env_kwargs)  # type: ignore[arg-type]
             if kind == "asynchronous" and hosted(vector_env):
                 raise ValueError(
                     f"{name} acts with several policies in one compiled program, which an environment outside of it ({env_name}) "
@@ -125,7 +126,7 @@ def plan(
             "id": env_name,
             "backend": _backend(vector_env),
             "num_envs": vector_env.num_envs if vector_env is not None else 0,
-            "kwargs": env_kwargs or {},
+            "kwargs": env_kwargs,
             "by_name": isinstance(env, str),
         },
         "learner": describe(inner) if inner is not None else {},
@@ -139,9 +140,7 @@ def plan(
         "eval_episodes": eval_episodes,
         "versions": versions(),
     }
-    return Plan(
-        whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs or {}, eval_episodes), config
-    )
+    return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs, eval_episodes), config)
 
 
 def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, learner: Learner | None = None) -> Plan:

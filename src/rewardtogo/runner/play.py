@@ -17,6 +17,7 @@ from PIL import Image
 
 from ..catalogue import ENVIRONMENTS
 from ..core import MASK, Learner
+from ..envs import atari
 from .evaluate import MAX_STEPS
 from .folder import RunFolder
 from .policy import LoadedPolicy, load
@@ -78,6 +79,8 @@ def _drawable(described: dict[str, Any], env: Any) -> gymnasium.Env:
             "give it from Python with play(run, env=...)"
         )
     base, keep = MASKED.get(name, (name, None))
+    if env is None and base.startswith(atari.PREFIX):
+        return atari.Game(base, render_mode="rgb_array", **described["kwargs"])
     if env is None and ":" not in base and base not in gymnasium.registry:
         what = "is one of the compiled environments without a picture" if name in ENVIRONMENTS else "is no environment"
         raise ValueError(f"{name} {what}: play shows runs in Gymnasium's environments")

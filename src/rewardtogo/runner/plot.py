@@ -90,15 +90,12 @@ def draw_curves(paths: Sequence[str | Path], out: str | Path) -> Path:
     One run is drawn as it is, faintly, with a running mean; several of one algorithm and environment as their mean with its 95 %
     interval. Evaluations, which act without exploring, are dots.
     """
-    file = Path(out)
-    if file.suffix.lower() not in ENDINGS:
-        raise ValueError(f"a picture is written to a file ending in {', '.join(ENDINGS)}, not to {out}")
+    file = picture_file(out)
     folders = run_folders(paths)
     groups: dict[str, list[RunFolder]] = {}
     for folder in folders:
         groups.setdefault(group_name(folder), []).append(folder)
     figure = Figure(figsize=(7.2, 4.3), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     same = len({name.split(" · ")[1] for name in groups}) == 1
     for i, (name, members) in enumerate(groups.items()):
@@ -106,6 +103,20 @@ def draw_curves(paths: Sequence[str | Path], out: str | Path) -> Path:
         _draw_group(axes, name.split(" · ")[0] if same else name, members, style)
     title = "" if not same else next(iter(groups)).split(" · ")[1] if len(groups) > 1 else next(iter(groups))
     _dress(axes, folders, title)
+    return save_figure(figure, file)
+
+
+def picture_file(out: str | Path) -> Path:
+    """The file that a picture goes to. Raises `ValueError` for a name that does not end like a picture's."""
+    file = Path(out)
+    if file.suffix.lower() not in ENDINGS:
+        raise ValueError(f"a picture is written to a file ending in {', '.join(ENDINGS)}, not to {out}")
+    return file
+
+
+def save_figure(figure: Figure, file: Path) -> Path:
+    """Write a picture."""
+    FigureCanvasAgg(figure)
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         figure.savefig(file, dpi=130)

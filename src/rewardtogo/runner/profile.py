@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from ..core import Algorithm, Learner, PRNGKey, Rollout, State
+from ..actor_critic.asynchronous import Asynchronous
+from ..core import Algorithm, Learner, PRNGKey, State
 from ..envs.gymnasium import GymnasiumEnv, hosted
-from ..loops.collect import begin, collect
-from ..loops.off_policy import OffPolicy, OffPolicyState
+from ..loops.collect import begin
+from ..loops.off_policy import OffPolicy
 from ..loops.on_policy import OnPolicy
-from .evaluate import Evaluator
+from .evaluate import Either, Evaluator
 from .evaluate_run import restore
 from .folder import RunFolder
 from .plan import Plan
@@ -34,6 +35,8 @@ MOST = 2**20
 """Iterations beyond which no part is run, however fast."""
 PATIENCE = 60.0
 """Seconds after which no further round begins."""
+_Halves = OnPolicy | OffPolicy | Asynchronous
+"""Loops whose iterations are made of acting and learning: those that have `act` and `learn`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +142,7 @@ def _measure(plan: Plan, state: State, clock: _Clock, rounds: int) -> Anatomy:
     evaluator = None if plan.eval_env is None else Evaluator(plan.eval_env, plan.config["eval_episodes"])
     # Copies, since the programs below reuse the memory of the state; the same ones and the same key, so that evaluation plays
     # the same episodes each time.
-    policies = [jax.tree.map(jnp.copy, algorithm.policy(state, explore)) for explore in (False, True)]
+    policies = [jax.tree.map(jnp.copy, Either.of(algorithm, state, explore)) for explore in (False, True)]
 
     def evaluate() -> None:
         if evaluator is not None:
@@ -191,7 +194,7 @@ class _Parts:
         self.algorithm, self.state, self.key = algorithm, state, key
         self.functions: dict[str, Callable] = {"whole": _whole}
         rollout: Any = ()
-        if isinstance(algorithm, (OnPolicy, OffPolicy)):
+        if isinstance(algorithm, _Halves):
             self.state, (rollout, _) = jax.jit(_collection)(algorithm, state, key, ())
             self.functions |= {"collection": _collection, "learning": _learning}
         self.rollout = rollout
@@ -240,32 +243,11 @@ def _whole(algorithm: Algorithm, state: State, key: PRNGKey, rollout: Any) -> tu
     return algorithm.step(state, key)
 
 
-def _collection(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollout: Any) -> tuple[State, Any]:
-    del rollout
-    policy = algorithm.policy(state, explore=True)
-    keep = algorithm.learner.batch == "sequences"
-    actor, found, episodes = collect(algorithm.env, policy, state.actor, key, algorithm.unroll, keep)
-    return eqx.tree_at(lambda s: s.actor, state, actor), (found, episodes)
+def _collection(algorithm: _Halves, state: State, key: PRNGKey, delivery: Any) -> tuple[State, Any]:
+    del delivery
+    state, delivery, episodes = algorithm.act(state, key)
+    return state, (delivery, episodes)
 
 
-def _learning(algorithm: OnPolicy | OffPolicy, state: State, key: PRNGKey, rollout: Rollout) -> tuple[State, Any]:
-    if isinstance(algorithm, OnPolicy):
-        learner, metrics, _ = algorithm.learner.update(state.learner, rollout, key)
-        return eqx.tree_at(lambda s: s.learner, state, learner), metrics
-    replay = algorithm.replay.add(state.replay, rollout.transitions)
-
-    def update(learner: State, key: PRNGKey) -> tuple[State, dict[str, jax.Array]]:
-        sample_key, update_key = jax.random.split(key)
-        if algorithm.learner.batch == "sequences":
-            batch = algorithm.replay.sample_sequences(replay, sample_key, algorithm.batch_size, algorithm.length)
-        else:
-            batch = algorithm.replay.sample(replay, sample_key, algorithm.batch_size)
-        learner, metrics, _ = algorithm.learner.update(learner, batch, update_key)
-        return learner, metrics
-
-    if algorithm.updates == 1:
-        learner, metrics = update(state.learner, key)
-    else:
-        learner, metrics = jax.lax.scan(update, state.learner, jax.random.split(key, algorithm.updates))
-        metrics = jax.tree.map(jnp.mean, metrics)
-    return OffPolicyState(learner, state.actor, replay), metrics
+def _learning(algorithm: _Halves, state: State, key: PRNGKey, delivery: Any) -> tuple[State, Any]:
+    return algorithm.learn(state, delivery, key)

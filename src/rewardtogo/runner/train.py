@@ -24,7 +24,7 @@ from ..data.files import Damaged, is_key, read_json, write_json
 from ..envs.gymnasium import EnvironmentFailure, hosted
 from ..ops.schedules import Constant, to_text
 from .engine import Callback, Every, Moment, Program, run, steps_after
-from .evaluate import Evaluator, lanes_for, summary
+from .evaluate import Either, Evaluator, lanes_for, summary
 from .folder import RunFolder, new_folders
 from .plan import Plan, check_budget, from_config, plan
 from .policy import LoadedPolicy, load, save_policy
@@ -209,7 +209,7 @@ class Session:
             self._save_policy(folder.path, state, moment.env_steps, None)
 
     def _policy(self, state: State, explore: bool) -> Any:
-        make: Callable = lambda s: self.plan.algorithm.policy(s, explore)  # noqa: E731
+        make: Callable = lambda s: Either.of(self.plan.algorithm, s, explore)  # noqa: E731
         return jax.vmap(make)(state) if self.batched else make(state)
 
     def _save_policy(self, path: Path, learned: State, env_steps: int, evaluation: float | None) -> None:
@@ -273,15 +273,14 @@ class Session:
                 env.close()
 
     def _prepare(self) -> None:
-        """What is needed later, beside the compilation of the training: programs that evaluate, and the library that draws.
+        """What is needed later, beside the compilation of the training: the program that evaluates, and the library that draws.
 
         What fails here is met again, and told, where it is needed.
         """
         if self.evaluator is not None and not hosted((self.plan.env, self.plan.eval_env)):
             with contextlib.suppress(Exception):
-                for explore in (False, True):
-                    policy = jax.eval_shape(partial(self._policy, explore=explore), self.program.shapes())
-                    self.evaluator.prepare(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy))
+                policy = jax.eval_shape(partial(self._policy, explore=False), self.program.shapes())
+                self.evaluator.prepare(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), policy))
         from . import plot as plot
 
     def _resumed(self, resume_from: Any) -> Moment:

@@ -41,9 +41,6 @@ from .outputs import Expectation, Outputs
 from .q_network import GreedyPolicy, QNetwork, expected, over
 from .targets import CORRECTIONS, Correction, bootstrapped, corrections, look, outputs_at, towards, traced
 
-PEAK = 0.9
-"""Weight of the largest error of a sequence in its priority; the rest is their mean's (R2D2)."""
-
 
 class DQNState(eqx.Module):
     """Online and target network, optimiser, what observations look like, and the number of updates done."""
@@ -145,7 +142,7 @@ class DQN(Learner):
 
     def update(
         self, state: DQNState, batch: Batch, key: PRNGKey
-    ) -> tuple[DQNState, dict[str, Array], Float[Array, "N"]]:
+    ) -> tuple[DQNState, dict[str, Array], Float[Array, "*T N"]]:
         now, t = self.at(state.updates), batch.transitions
         norm = None if state.norm is None else state.norm.update(t.observation)
         t = t if norm is None else _standardised(norm, t)
@@ -175,8 +172,7 @@ class DQN(Learner):
         }
         tau = jnp.where(updates % self.target_period == 0, now.target_rate, 0.0)
         state = DQNState(network, towards(state.target, network, tau), optimiser, norm, updates)
-        size = jnp.abs(error)
-        return state, metrics, size if size.ndim == 1 else PEAK * size.max(0) + (1.0 - PEAK) * size.mean(0)
+        return state, metrics, jnp.abs(error)
 
     def _steps(self, network: QNetwork, target: QNetwork, t: Transition) -> Transition:
         """The steps that the batch has targets for, with what both networks see: `Seen` where observations are."""

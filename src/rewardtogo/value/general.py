@@ -53,7 +53,7 @@ class Rates(eqx.Module):
             )
         return Rates(
             algorithm.steps_per_iteration,
-            algorithm.replay.capacity,
+            algorithm.replay.size,
             algorithm.updates,
             algorithm.batch_size,
             learner.target_period,
