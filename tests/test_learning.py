@@ -43,6 +43,7 @@ CLAIMS = [
     Claim("ppo", "CartPole-v1", 100_000, 475, backend="gymnasium"),
     Claim("dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.5 6.6 6.14"),
     Claim("dqn", "Catch", 40_000, 0.95, items="6.6"),
+    Claim("dqn", "Acrobot-v1", 100_000, -100, items="6.6"),
     Claim("per_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("c51", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("qr_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),

@@ -71,17 +71,32 @@ PRESETS: dict[tuple[str, str], Preset] = {
     },
     # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
     ("dqn", "CartPole-v1"): _DQN_CARTPOLE,
+    # Median -87.7 in five seeds (worst -91.2); with standardised observations and twice the updates -88.4 (worst -92.8).
+    ("dqn", "Acrobot-v1"): {
+        "steps": 100_000,
+        "num_envs": 1,
+        "loop": {"unroll": 4, "updates": 2, "batch_size": 128, "length": 4},
+        "learner": {
+            "learning_rate": "linear:6.3e-4:1e-4",
+            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
+            "epsilon": "linear:1:0.05:0.12",
+            "n_step": 4,
+            "target_period": 250,
+            "double": True,
+            "huber": 10.0,
+        },
+    },
     ("double_dqn", "CartPole-v1"): _DQN_CARTPOLE,
     ("dueling_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64]),
     ("noisy_dqn", "CartPole-v1"): _dqn_cartpole(network=_TANH_64, head_sizes=[64], epsilon=0.0),
-    # Whole distributions cost more an update and need fewer.
+    # Whole distributions cost more an update; C51 needs fewer of them. Quantiles with half as many reached 475 in three seeds of five.
     ("c51", "CartPole-v1"): {
         **_dqn_cartpole(outputs={"class": "c51", "least": 0.0, "most": 100.0}, target_period=200),
         "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
     },
     ("qr_dqn", "CartPole-v1"): {
-        **_dqn_cartpole(outputs={"class": "quantiles", "count": 32}, huber=1.0, target_period=200),
-        "loop": {"unroll": 4, "updates": 2, "batch_size": 64, "length": 8},
+        **_dqn_cartpole(outputs={"class": "quantiles", "count": 32}, huber=1.0, learning_rate="linear:1e-3:5e-5"),
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 64, "length": 8},
     },
     ("target_q", "CartPole-v1"): _dqn_cartpole(),
     ("q_replay", "CartPole-v1"): _dqn_cartpole(target_period=1),

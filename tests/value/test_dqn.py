@@ -12,6 +12,7 @@ import pytest
 import rewardtogo as rtg
 from algorithms_under_test import MaskedProbe, first_gradient, jit, small
 from rewardtogo.core import MASK, Batch, EnvSpec, Transition, from_space
+from rewardtogo.ops import Linear
 from rewardtogo.value.dqn import DQNState
 
 KEY = jax.random.key(0)
@@ -53,7 +54,7 @@ def test_the_worked_example_tells_its_cases_apart():
 
 
 @pytest.mark.parametrize("double", [False, True])
-def test_targets_are_those_worked_out_by_hand(double):
+def test_targets_are_those_worked_out_by_hand(double, item):
     """A terminated step adds nothing, a truncated one bootstraps; priorities are the absolute errors."""
     learner = rtg.DQN(
         network=LINEAR, gamma=0.9, double=double, huber=1e9, target_period=99, max_grad_norm=1e9, epsilon=0.1
@@ -62,6 +63,9 @@ def test_targets_are_those_worked_out_by_hand(double):
     new, metrics, priorities = jit(lambda s, b: learner.update(s, b, KEY))(state_of(learner), batch(weights))
     error = Q - targets(double)
     np.testing.assert_allclose(priorities, np.abs(error), rtol=1e-5)
+    with item("6.14" if double else "6.6") as check:
+        gap = float(np.abs(priorities - np.abs(error)).max())
+        check(gap, "<=", 1e-5, f"{'double' if double else 'plain'} targets of a batch, by hand")
     assert float(metrics["q_loss"]) == pytest.approx(np.mean(np.array(weights) * 0.5 * error**2), rel=1e-5)
     assert float(metrics["td_error"]) == pytest.approx(np.abs(error).mean(), rel=1e-5)
     assert float(metrics["q_mean"]) == pytest.approx(Q.mean(), rel=1e-5)
@@ -130,13 +134,24 @@ def test_exploration_is_epsilon_greedy():
     assert set(np.asarray(act(learner.policy(state, explore=False), keys)).tolist()) == {0}
 
 
-def test_epsilon_follows_its_schedule():
+def test_epsilon_follows_its_schedule(item):
     learner = rtg.OffPolicy(rtg.make("CartPole-v1", 1), rtg.DQN(network=small), updates=2).with_horizon(50).learner
     state = learner.init(SPEC, KEY)
     for updates, epsilon in ((0, 1.0), (10, 0.525), (20, 0.05), (99, 0.05)):
         at = eqx.tree_at(lambda s: s.updates, state, jnp.asarray(updates, jnp.int32))
         assert float(learner.policy(at, explore=True).epsilon) == pytest.approx(epsilon, rel=1e-5)  # type: ignore[attr-defined]
         assert float(learner.policy(at, explore=False).epsilon) == 0.0  # type: ignore[attr-defined]
+    rates = rtg.DQN(learning_rate=Linear(1e-3, 1e-4), epsilon=Linear(1.0, 0.05, fraction=0.2))
+    rates = rtg.OffPolicy(rtg.make("CartPole-v1", 1), rates).with_horizon(100).learner
+    ends = [float(value(i)) for value in (rates.learning_rate, rates.epsilon) for i in (0, 100)]  # type: ignore[attr-defined]
+    with item("6.29") as check:
+        wanted = np.float32([1e-3, 1e-4, 1.0, 0.05]).tolist()
+        check(
+            max(abs(a - b) for a, b in zip(ends, wanted, strict=True)),
+            "==",
+            0,
+            "ends of the schedules of rate and epsilon",
+        )
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 1.0])

@@ -270,6 +270,13 @@ def test_data_without_probabilities_is_refused():
             learner.update(learner.init(SPEC, KEY), Batch(t, batch.indices, batch.weights), KEY)
 
 
+def test_a_burn_in_that_leaves_nothing_is_refused():
+    learner = rtg.DQN(network=lstm, epsilon=0.1, burn_in=T)
+    state = learner.init(SPEC, KEY)
+    with pytest.raises(ValueError, match="burn_in=5 leaves nothing to learn from of sequences of 5 steps"):
+        learner.update(state, sequences(state.network.torso.init()), KEY)
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

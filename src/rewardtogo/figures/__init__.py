@@ -22,6 +22,7 @@ FIGURES = {
         "parallel_workers",
         "synchronous and asynchronous workers: who acts with which version of the parameters",
     ),
+    "overestimation": ("overestimation", "estimated and true values while DQN and double DQN learn"),
     "estimators": ("estimator_variances", "exact variance and bias of every policy-gradient estimator"),
     "bias-variance": (
         "bias_variance",

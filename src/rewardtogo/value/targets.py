@@ -41,7 +41,14 @@ class Seen(eqx.Module):
 
 
 def look(network: QNetwork, target: QNetwork, t: Transition, burn_in: int = 0) -> Transition:
-    """The same steps without the first `burn_in`, with `Seen` in place of observations."""
+    """The same steps without the first `burn_in`, with `Seen` in place of observations.
+
+    Raises `ValueError` where nothing is left.
+    """
+    if burn_in and t.reward.shape[0] <= burn_in:
+        raise ValueError(
+            f"burn_in={burn_in} leaves nothing to learn from of sequences of {t.reward.shape[0]} steps: give the loop a larger length"
+        )
     online, online_ahead = network.along(t, burn_in)
     old, old_ahead = target.along(t, burn_in)
     t = jax.tree.map(lambda x: x[burn_in:], t) if burn_in else t
