@@ -264,7 +264,9 @@ def continuous(size: "Size") -> list[Row]:
         found = measure(
             {"ours": ours("train", name, "--steps", size.continuous), "sb3": sb3(name, size.continuous)}, size.repeats
         )
-        what = f"{name.upper()}, Pendulum-v1, 1 environment, batch 256 every step, 256x256 ReLU, {size.continuous:,} steps"
+        what = (
+            f"{name.upper()}, Pendulum-v1, 1 environment, batch 256 every step, 256x256 ReLU, {size.continuous:,} steps"
+        )
         rows.append(against(what, found["ours"], peer_name("sb3"), found["sb3"], 2))
         result = measure({"dots": ours("dots", name, "--repeats", size.laps)}, 1)["dots"]
         title = f"{name.upper()}, a whole step against `jnp.dot` on the shapes it needs, in a scan"
@@ -368,7 +370,16 @@ def memory(size: "Size") -> list[Row]:
     return [row]
 
 
-GROUPS = {"ppo": ppo, "dqn": dqn, "continuous": continuous, "zoo": zoo, "seeds": seeds, "door": door, "start": start, "memory": memory}
+GROUPS = {
+    "ppo": ppo,
+    "dqn": dqn,
+    "continuous": continuous,
+    "zoo": zoo,
+    "seeds": seeds,
+    "door": door,
+    "start": start,
+    "memory": memory,
+}
 
 
 @dataclass

@@ -20,7 +20,13 @@ from rewardtogo.runner.engine import Program
 ENV = "CartPole-v1"
 PPO: dict[str, Any] = {"learning_rate": 3e-4, "epochs": 4, "minibatches": 4, "network": {"sizes": [64, 64]}}
 DQN: dict[str, Any] = {"learning_rate": 1e-3, "target_period": 250}
-CONTINUOUS: dict[str, Any] = {"batch_size": 256, "unroll": 1, "updates": 1, "warm_up": 1000, "replay": {"capacity": 100_000}}
+CONTINUOUS: dict[str, Any] = {
+    "batch_size": 256,
+    "unroll": 1,
+    "updates": 1,
+    "warm_up": 1000,
+    "replay": {"capacity": 100_000},
+}
 OFF: dict[str, Any] = {"batch_size": 64, "unroll": 4, "updates": 1, "warm_up": 1000, "replay": {"capacity": 100_000}}
 
 

@@ -8,6 +8,8 @@ from typing import Any
 Preset = dict[str, Any]
 
 _PPO = {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_grad_norm": 5.0}
+_SMALL = {"class": "mlp", "sizes": [64, 64], "activation": "relu"}
+_SMALL_LOOP = {"unroll": 1, "updates": 1, "batch_size": 128, "warm_up": 500, "replay": {"capacity": 20_000}}
 
 PRESETS: dict[tuple[str, str], Preset] = {
     # Every one was found here; scores over seeds are in docs/results.md.
@@ -61,6 +63,26 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "max_grad_norm": 100.0,
         },
     },
+    # A small network and a batch of 128 do as well as 256x256 and 256 here, in an eighth of the time.
+    ("ddpg", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    ("td3", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    ("sac", "Pendulum-v1"): {
+        "steps": 20_000,
+        "num_envs": 1,
+        "loop": _SMALL_LOOP,
+        "learner": {
+            "network": _SMALL,
+            "learning_rate": 1e-3,
+            "actor_learning_rate": 1e-3,
+            "temperature_learning_rate": 1e-3,
+        },
+    },
+    ("naf", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    ("cem_q", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    # The usual settings for MuJoCo's tasks (the papers', RL Zoo's); the defaults of the learners are the rest of them.
+    ("ddpg", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
+    ("td3", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
+    ("sac", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,

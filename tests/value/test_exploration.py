@@ -33,7 +33,12 @@ def test_ornstein_uhlenbeck_has_its_exact_sd_and_correlation(item):
     exact = 0.2 / np.sqrt(1 - 0.85**2)
     with item("6.26") as check:
         check(abs(exact - 0.3797), "<=", 5e-5, "the formula at 0.15, 0.2, 1, against the number in the list")
-        check(abs(x.std() / exact - 1), "<=", 0.01, "standard deviation, relative to sigma sqrt(dt) / sqrt(1 - (1 - theta dt)^2)")
+        check(
+            abs(x.std() / exact - 1),
+            "<=",
+            0.01,
+            "standard deviation, relative to sigma sqrt(dt) / sqrt(1 - (1 - theta dt)^2)",
+        )
         for lag in (1, 5):
             found = (x[lag:] * x[:-lag]).mean() / (x * x).mean()
             check(abs(found - 0.85**lag), "<=", 0.01, f"autocorrelation at lag {lag}, (1 - theta dt)^{lag}")

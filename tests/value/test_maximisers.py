@@ -55,7 +55,9 @@ def test_random_shooting_has_the_rates_of_the_nearest_of_k_points(item):
                 slope = math.log(many / few) / math.log(counts[1] / counts[0])
                 check(abs(slope * d / power + 1), "<=", 0.1, f"exponent -{power}/{d}: relative error")
         best = jit(jax.vmap(lambda key: sampled_maximum(hill, *box(1), key, 1000).value))(keys)
-        check(float(best.min()), ">=", 0.99, "value of the best of 1000, d = 1, of the maximum 1: the worst of 1500 times")
+        check(
+            float(best.min()), ">=", 0.99, "value of the best of 1000, d = 1, of the maximum 1: the worst of 1500 times"
+        )
 
 
 SLOPE = np.array([[2.0, 0.6, 0.2], [0.6, 1.0, -0.3], [0.2, -0.3, 0.15]], np.float32)
@@ -72,7 +74,9 @@ def test_ascent_comes_to_the_top_of_a_concave_quadratic(newton, item):
     steps = 15 if newton else 300
     best = jit(lambda k: ascended_maximum(f, low, high, k, 2, steps, newton))(KEY)
     with item("6.22") as check:
-        check(np.abs(best.action - CENTRE).max(), "<=", 1e-4, f"error of the action, {'Newton' if newton else 'gradient'}")
+        check(
+            np.abs(best.action - CENTRE).max(), "<=", 1e-4, f"error of the action, {'Newton' if newton else 'gradient'}"
+        )
         check(-float(best.value), "<=", 1e-7, "loss in value")
 
 
@@ -100,7 +104,12 @@ def test_restarts_find_the_highest_of_many_hills(item):
         lambda keys: tuple(jax.vmap(lambda k: ascended_maximum(f, *box(2), k, n, 40).value)(keys) for n in (32, 1))  # noqa: B023
     )(keys)
     with item("6.22") as check:
-        check((np.asarray(many) / highest).min(), ">=", 0.95, "share of the highest hill, 32 starts: the worst of 100 times")
+        check(
+            (np.asarray(many) / highest).min(),
+            ">=",
+            0.95,
+            "share of the highest hill, 32 starts: the worst of 100 times",
+        )
         check((np.asarray(one) / highest).mean(), "<", 0.95, "one start does not do it: mean share of the highest hill")
 
 

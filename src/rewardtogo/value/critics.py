@@ -2,9 +2,9 @@ r"""Networks for Q-learning with continuous actions: critics Q(s, a), several si
 
 They work in units of the box: 0 is its centre and -1 and 1 are its bounds, whatever these are.
 
-A feed-forward critic reads observation and action together, so that every layer sees both. Where the recipe has a memory, the memory is
-of observations, and the recipe's decoder reads what is remembered together with the action; a module of the user's own reads the observation, and one
-dense layer of the same width joins its features and the action.
+A feed-forward critic reads observation and action together, so that every layer sees both. Where the recipe has a memory, the
+memory is of observations, and the recipe's decoder reads what is remembered together with the action; a module of the user's own reads
+the observation, and one dense layer of the same width joins its features and the action.
 
 Source: notes 6.3.3; Lillicrap et al. 2016; Fujimoto et al. 2018 (two critics).
 """
@@ -45,7 +45,9 @@ def require_box(owner: str, spec: EnvSpec, bounded: bool = True) -> None:
     require_action(owner, spec, ("box",))
     action = spec.action
     if action.size == 0:
-        raise ValueError(f"{owner} cannot choose actions without entries: the action space has the shape {action.shape}")
+        raise ValueError(
+            f"{owner} cannot choose actions without entries: the action space has the shape {action.shape}"
+        )
     low, high = action.bounds()
     open_entries = np.argwhere(~(np.isfinite(low) & np.isfinite(high)))
     if bounded and len(open_entries):
@@ -94,7 +96,11 @@ def features_along(torso: Torso, carry: Carry, t: Transition) -> tuple[Float[Arr
 def _joint(action: Spec, seen: Spec) -> Spec:
     units = Spec("box", action.shape, low=(-1.0,), high=(1.0,))
     name, other = PAIR
-    parts = tuple((f"{other}.{k}", part) for k, part in seen.parts if k != MASK) if seen.kind == "dict" else ((other, seen),)
+    parts = (
+        tuple((f"{other}.{k}", part) for k, part in seen.parts if k != MASK)
+        if seen.kind == "dict"
+        else ((other, seen),)
+    )
     return Spec("dict", dtype="", parts=((name, units), *parts))
 
 
@@ -119,7 +125,10 @@ class Critic(eqx.Module):
         """Fresh parameters."""
         reader_key, torso_key, head_key = jax.random.split(key, 3)
         if isinstance(network, (GRU, LSTM)):
-            reader, last = dataclasses.replace(network, decoder=MLP()).build(spec.observation, reader_key), network.decoder
+            reader, last = (
+                dataclasses.replace(network, decoder=MLP()).build(spec.observation, reader_key),
+                network.decoder,
+            )
         elif isinstance(network, Custom):
             reader = network.build(spec.observation, reader_key)
             last = MLP(reader.features, activation="relu")
