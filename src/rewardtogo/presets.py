@@ -65,6 +65,13 @@ PRESETS: dict[tuple[str, str], Preset] = {
     },
     # A small network and a batch of 128 do as well as 256x256 and 256 here, in an eighth of the time.
     ("ddpg", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    # Noise that keeps its direction gets the car out of the valley, as in RL Zoo; four cars, and an update for every eighth step.
+    ("ddpg", "MountainCarContinuous-v0"): {
+        "steps": 300_000,
+        "num_envs": 4,
+        "loop": {"unroll": 16, "updates": 8, "batch_size": 128, "warm_up": 1000, "replay": {"capacity": 300_000}},
+        "learner": {"network": _SMALL, "noise": {"class": "ou", "sigma": 0.5}},
+    },
     ("td3", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
     ("sac", "Pendulum-v1"): {
         "steps": 20_000,
@@ -77,7 +84,13 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "temperature_learning_rate": 1e-3,
         },
     },
-    ("naf", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    # With outputs in units of 1 reward, three seeds of five ended at a bound.
+    ("naf", "Pendulum-v1"): {
+        "steps": 20_000,
+        "num_envs": 1,
+        "loop": _SMALL_LOOP,
+        "learner": {"network": _SMALL, "value_scale": 30.0},
+    },
     ("cem_q", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
     # The usual settings for MuJoCo's tasks (the papers', RL Zoo's); the defaults of the learners are the rest of them.
     ("ddpg", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},

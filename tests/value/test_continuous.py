@@ -18,6 +18,7 @@ from rewardtogo.envs.reward_wrappers import ScaleReward
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
 from rewardtogo.ops import Linear
+from rewardtogo.runner.config import build, describe
 from rewardtogo.value.critics import Critics, from_units, to_units
 from rewardtogo.value.naf import NAFNetwork
 
@@ -395,6 +396,16 @@ def test_critics_read_everything_together():
     bare = Critics.of(rtg.nn.Custom(lambda spec, key: eqx.nn.Linear(3, 4, key=key)), SPEC, KEY, 2)
     q = bare(bare.see((), jnp.ones(3)), jnp.zeros(2)), bare(bare.see((), jnp.ones(3)), jnp.ones(2))
     assert np.any(q[0] != q[1])
+
+
+def test_noises_and_searches_are_plain_data_and_back():
+    learner = rtg.CEMQ(maximiser=rtg.Ascent(3, newton=True), noise=rtg.OU(0.3, dt=0.5))
+    data = describe(learner)
+    assert data["noise"] == {"class": "OU", "sigma": 0.3, "theta": 0.15, "dt": 0.5}
+    again = build(rtg.CEMQ, data)
+    assert describe(again) == data and isinstance(again.maximiser, rtg.Ascent)
+    named = build(rtg.TD3, {"noise": {"class": "ou", "sigma": "linear:0.4:0.1"}})
+    assert named.noise.sigma == Linear(0.4, 0.1)
 
 
 # --- what they learn --------------------------------------------------------------------------------------------------

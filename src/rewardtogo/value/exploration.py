@@ -17,6 +17,7 @@ Source: notes 6.3.3; Uhlenbeck and Ornstein 1930; Lillicrap et al. 2016; Fujimot
 """
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -79,6 +80,15 @@ class OU(Noise):
     def stationary_sd(self) -> Float[Array, ""]:
         """Its standard deviation in the long run, the root of Var = (1 - theta dt)^2 Var + sigma^2 dt."""
         return self.sigma * jnp.sqrt(self.dt) / jnp.sqrt(1.0 - (1.0 - self.theta * self.dt) ** 2)
+
+
+def as_noise(noise: Any) -> Noise:
+    """What was given, if it is a noise. Raises `ValueError` otherwise."""
+    if not isinstance(noise, Noise):
+        raise ValueError(
+            f"noise on actions is rtg.Gaussian(0.1) or rtg.OU(0.2), or gaussian or ou by name, not {noise!r}"
+        )
+    return noise
 
 
 class NoisyMemory(eqx.Module):

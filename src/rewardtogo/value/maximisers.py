@@ -13,6 +13,7 @@ up and doubles the next one, and undoes one that went down and halves it: no ste
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -145,6 +146,15 @@ class Maximiser(Configured):
     @abstractmethod
     def __call__(self, value: Value, shape: tuple[int, ...], key: PRNGKey) -> Maximum:
         """The best action between -1 and 1 in each entry, and its value."""
+
+
+def as_maximiser(maximiser: Any) -> Maximiser:
+    """What was given, if it is a maximiser. Raises `ValueError` otherwise."""
+    if not isinstance(maximiser, Maximiser):
+        raise ValueError(
+            f"a maximiser is rtg.Sampled(), rtg.Ascent() or rtg.CEM(), or sampled, ascent or cem by name, not {maximiser!r}"
+        )
+    return maximiser
 
 
 class Sampled(Maximiser):

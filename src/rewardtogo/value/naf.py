@@ -42,7 +42,7 @@ from ..core import (
 from ..nn import MLP, Linear, Network, Optimiser, RunningNorm, Torso, as_network, global_norm
 from .continuous import Memories, Sample, follow, require_short
 from .critics import SMALL, features_along, from_units, over, require_box
-from .exploration import Gaussian, Noise, Noisy
+from .exploration import Gaussian, Noise, Noisy, as_noise
 
 MOST_LOG_DIAGONAL = 5.0
 """The diagonal of L is at most the exponential of this."""
@@ -149,7 +149,7 @@ class NAF(Learner):
     )
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
     target_rate: Number = number(0.005, "tau: how far the target moves towards the network", above=0, at_most=1)
-    noise: Noise = part(Gaussian(0.2), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.2), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")

@@ -31,7 +31,7 @@ from .continuous import (
     require_short,
 )
 from .critics import Actor, Critics, least, require_box
-from .exploration import Gaussian, Noise, Noisy
+from .exploration import Gaussian, Noise, Noisy, as_noise
 
 
 class TD3(Learner):
@@ -46,7 +46,7 @@ class TD3(Learner):
     policy_delay: int = setting(2, "updates of the critics for one of the actor and of all targets", at_least=1)
     smoothing: Number = number(0.2, "sd of the noise on the target's action, in units of half the box", at_least=0)
     smoothing_limit: Number = number(0.5, "this noise is clipped here", at_least=0)
-    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(1000.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
