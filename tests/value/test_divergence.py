@@ -5,7 +5,7 @@ import pytest
 
 from rewardtogo.envs.tabular_problems import random_mdp, random_policy
 from rewardtogo.exact import induced_chain, stationary_distribution
-from rewardtogo.value.bellman_error import (
+from rewardtogo.value.bellman_errors import (
     bellman_error,
     double_sample_error,
     greedy_support,
