@@ -243,6 +243,23 @@ def test_a_small_ring_with_long_sequences():
     assert float(sum_tree.total(state.order.tree)) == 2.0
 
 
+def test_large_blocks_leave_every_sum_right():
+    """Blocks of 15 rows in 5 environments, of whose places only every 16th is looked at: through the seam, twice."""
+    memory, rows, envs, unroll, length = rtg.PrioritisedReplay(30 * 5, beta=0.5), 30, 5, 15, 4
+    wide = jax.tree.map(lambda x: jnp.zeros((unroll, envs, *x.shape[2:]), x.dtype), block(0))
+    state, grow = memory.init(wide, unroll, length), jit(memory.add)
+    for i in range(1, 6):
+        state = dataclasses.replace(
+            state, order=dataclasses.replace(state.order, largest=jnp.asarray(float(i), jnp.float32))
+        )
+        state = grow(state, wide)
+        for below, above in itertools.pairwise(state.order.tree):
+            np.testing.assert_allclose(np.ravel(above)[: len(below)], below.sum(1), rtol=1e-6)
+        p = np.ravel(state.order.tree[0])[: rows * envs].reshape(rows, envs)
+        assert (p > 0).sum() == envs * (min(rows, unroll * i) - length + 1)
+        assert (p == i).sum() == envs * (unroll if i > 1 else unroll - length + 1)
+
+
 def test_nothing_is_copied_in_a_compiled_loop():
     """The tree of a million priorities and the ring are changed in place: the program has no copy of either."""
     memory = rtg.PrioritisedReplay(2**20, beta=0.5)

@@ -59,10 +59,6 @@ class PrioritisedReplay(Replay):
     def size(self) -> int:
         return self.capacity
 
-    @property
-    def wants_feedback(self) -> bool:
-        return True
-
     def init(self, example: Transition, unroll: int, length: int = 1) -> ReplayState:
         state = begin(example, self.capacity, unroll, self.frames)
         tree = sum_tree.zeros(state.storage.reward.size)

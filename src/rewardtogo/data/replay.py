@@ -38,11 +38,6 @@ class Replay(Configured):
     def size(self) -> int:
         """How many steps it holds at most."""
 
-    @property
-    @abstractmethod
-    def wants_feedback(self) -> bool:
-        """Whether it must be told what a learner made of its batches."""
-
     @abstractmethod
     def init(self, example: Transition, unroll: int, length: int = 1) -> ReplayState:
         """An empty memory for blocks `[unroll, B, ...]` like `example`, of which only shapes and types are used, out of which
@@ -80,10 +75,6 @@ class UniformReplay(Replay):
     @property
     def size(self) -> int:
         return self.capacity
-
-    @property
-    def wants_feedback(self) -> bool:
-        return False
 
     def init(self, example: Transition, unroll: int, length: int = 1) -> ReplayState:
         del length
