@@ -20,7 +20,7 @@ from rewardtogo.catalogue import ALGORITHMS, LOOPS, Row
 from rewardtogo.cli.main import _nested, _parsers
 from rewardtogo.core import Transition, env_spec
 from rewardtogo.data.episodes import Dataset
-from rewardtogo.runner.config import PARTS, build, options, resolve
+from rewardtogo.runner.config import PARTS, build, merge, options, resolve
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -146,8 +146,9 @@ def test_command_is_one(page, line, monkeypatch):
         return
     groups = _nested(rest, ("learner", "loop", "env"))
     cls = class_of(given.algorithm)
-    learner = build(cls, groups["learner"])
-    kind = ALGORITHMS[given.algorithm].loop if given.algorithm in ALGORITHMS else "on_policy"
+    row = ALGORITHMS.get(given.algorithm)
+    learner = build(cls, merge(row.learner if row else {}, groups["learner"]))
+    kind = row.loop if row else "on_policy"
     assert set(groups["loop"]) <= set(options(resolve(LOOPS[kind]))), line
     assert isinstance(learner, rtg.Learner)
 
