@@ -312,3 +312,28 @@ def test_what_cannot_be_is_refused(make, words):
     with pytest.raises((ValueError, TypeError)) as refused:
         make()
     assert all(word in str(refused.value) for word in words.split()) or "Type" in type(refused.value).__name__
+
+
+@pytest.mark.slow
+def test_cartpole_from_random_play(tmp_path, item):
+    """20,000 transitions of a uniformly random policy, seen by no learner while they were made."""
+    from rewardtogo.core import env_spec
+    from rewardtogo.data import Dataset
+    from rewardtogo.loops import RandomPolicy, begin
+
+    env = rtg.make("CartPole-v1", 1)
+    policy = RandomPolicy(env_spec(env))
+    play = jax.jit(lambda key: rtg.collect(env, policy, begin(env, policy, key), key, 20_000)[1].transitions)
+    t = jax.tree.map(lambda x: np.array(x[:, 0]), jax.device_get(play(jax.random.key(0))))
+    t.truncated[-1] = not t.terminated[-1]
+    data = Dataset.of(jax.tree.map(jnp.asarray, t), env_spec(env))
+    options = {"learning_rate": "linear:1e-3:1e-4", "target_period": 250}
+    run = rtg.train("fqi", "CartPole-v1", steps=20_000, data=data, learner=options, out=tmp_path / "run", quiet=True)
+    best = max(row for row in run.metrics["eval_return_mean"] if np.isfinite(row))
+    with item("5.14") as check:
+        check(
+            run.evaluation["return_mean"],
+            ">=",
+            200,
+            f"CartPole, deep, 20,000 gradient steps (best evaluation {best:.0f})",
+        )

@@ -131,6 +131,11 @@ def _sweep_on(
     return jax.lax.while_loop(lambda s: ~s.done & (s.sweeps < limit), one, state)
 
 
+@jax.jit
+def _look(ahead: Lookahead, value: Float[Array, "S"]) -> Float[Array, "S A"]:
+    return ahead.q(value)
+
+
 def _sweeps(
     problem: Problem,
     sweep: Sweep,
@@ -159,7 +164,7 @@ def _sweeps(
         if spread and bool(state.done):
             change = np.asarray(state.change)
             value = value + gamma / (1 - gamma) * 0.5 * (change.max() + change.min())
-        q = np.asarray(jax.jit(lambda a, v: a.q(v))(on_device, jnp.asarray(value)))
+        q = np.asarray(_look(on_device, jnp.asarray(value)))
     stats = {"sweeps": np.asarray(swept), "residuals": np.asarray(state.residuals)[: min(swept, HISTORY)]}
     return value, q, bool(state.done), stats
 
