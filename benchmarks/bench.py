@@ -31,7 +31,13 @@ ROOT = HERE.parent
 RESULTS = ROOT / "docs" / "results.md"
 START, END = "<!-- bench:start -->", "<!-- bench:end -->"
 BIN = "Scripts" if os.name == "nt" else "bin"
-PEERS = {"sb3": "Stable-Baselines3", "sbx": "SBX", "rejax": "rejax"}
+PEERS = {
+    "sb3": "Stable-Baselines3",
+    "sbx": "SBX",
+    "rejax": "rejax",
+    "quantecon": "quantecon",
+    "mdptoolbox": "pymdptoolbox",
+}
 NOT_MEASURED = "not measured"
 ZOO = (
     "--preset none --num-envs 8 --loop.unroll 32 --learner.epochs 20 --learner.minibatches 1 --learner.gamma 0.98 "
@@ -51,7 +57,7 @@ def peer_python(peer: str) -> Path:
 
 def requirements(peer: str) -> list[Path]:
     """What is installed, in this order: PyTorch by itself first, so that nothing else decides which build it is."""
-    return [*([HERE / "peers" / "torch.txt"] if peer != "rejax" else []), HERE / "peers" / f"{peer}.txt"]
+    return [*([HERE / "peers" / "torch.txt"] if peer in ("sb3", "sbx") else []), HERE / "peers" / f"{peer}.txt"]
 
 
 def peer_name(peer: str) -> str:
@@ -428,6 +434,30 @@ def memory(size: "Size") -> list[Row]:
     return [row]
 
 
+def planning(size: "Size") -> list[Row]:
+    """Value iteration on a random decision process, beside tabular packages. Each stops by its own rule for the same ε; ours by both."""
+    script = str(HERE / "peers" / "run_dp.py")
+    peer = lambda name: Contender(lambda: [str(peer_python(name)), script, name], name)  # noqa: E731
+    contenders = {
+        "ours": ours("dp", "--repeats", size.laps),
+        "quantecon": peer("quantecon"),
+        "mdptoolbox": peer("mdptoolbox"),
+    }
+    found = measure(contenders, size.repeats)
+    mine, rows = found["ours"], []
+    what = "value iteration, 10,000 states, 10 actions, 10 successors, γ = 0.95, ε = 0.01, stopped by "
+    # quantecon stops by the norm of the change, pymdptoolbox by its spread.
+    for name, stop, least in (("quantecon", "norm", 1), ("quantecon", "bounds", None), ("mdptoolbox", "bounds", 20)):
+        other = found[name]
+        failed = "error" in mine or "error" in other
+        ratio = None if failed else other["seconds"] / mine[stop]
+        cell = mine.get("error") or f"{1e3 * mine[stop]:.1f} ms, {mine[f'{stop}_sweeps']:.0f} sweeps"
+        theirs = other.get("error") or f"{1e3 * other['seconds']:.1f} ms, {other['sweeps']:.0f} sweeps"
+        met = None if least is None or "error" in other else ratio is not None and ratio >= least
+        rows.append(Row(what + stop, cell, f"{peer_name(name)}: {theirs}", ratio, f"≥ {least} x" if least else "", met))
+    return rows
+
+
 GROUPS = {
     "ppo": ppo,
     "dqn": dqn,
@@ -441,6 +471,7 @@ GROUPS = {
     "door": door,
     "start": start,
     "memory": memory,
+    "planning": planning,
 }
 
 

@@ -269,7 +269,40 @@ def dots(given: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-TASKS = {"dots": dots, "train": train, "seeds": seeds, "door": door, "start": start, "memory": memory}
+def dp(given: argparse.Namespace) -> dict[str, Any]:
+    """Seconds of value iteration on the process that `peers/run_dp.py` solves: stopped by the norm, by bounds, and with compilation."""
+    from rewardtogo.envs.sparse import SparseMDP
+    from rewardtogo.value import value_iteration
+
+    states, actions, width = 10_000, 10, 10
+    rng = np.random.default_rng(0)
+    successors = rng.integers(0, states, (states, actions, width))
+    probabilities = rng.dirichlet(np.ones(width), (states, actions))
+    problem = SparseMDP(successors, probabilities, rng.normal(size=(states, actions)), discount=0.95)
+    found: dict[str, Any] = {}
+    for stop in ("norm", "bounds"):
+        times = []
+        for _ in range(1 + given.repeats):
+            began = time.perf_counter()
+            solution = value_iteration(problem, tolerance=0.01, stop=stop)
+            times.append(time.perf_counter() - began)
+        found |= {
+            stop: statistics.median(times[1:]),
+            f"{stop}_first": times[0],
+            f"{stop}_sweeps": int(solution.stats["sweeps"]),
+        }
+    return {**found, "value": float(solution.value.values.mean())}
+
+
+TASKS = {
+    "train": train,
+    "dots": dots,
+    "dp": dp,
+    "seeds": seeds,
+    "door": door,
+    "start": start,
+    "memory": memory,
+}
 
 
 def main() -> None:

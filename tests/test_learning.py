@@ -42,8 +42,8 @@ CLAIMS = [
     Claim("ppo", "CartPole-v1", 100_000, 475, items="7.27"),
     Claim("ppo", "CartPole-v1", 100_000, 475, backend="gymnasium"),
     Claim("dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.5 6.6 6.14"),
+    Claim("dqn", "Catch", 40_000, 0.95, items="6.6"),
     Claim("dqn", "Acrobot-v1", 100_000, -100, items="6.6"),
-    Claim("dqn", "Catch", 20_000, 0.95, items="6.6"),
     Claim("per_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("c51", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
     Claim("qr_dqn", "CartPole-v1", 50_000, 475, seeds=4, items="6.28"),
@@ -68,6 +68,12 @@ CLAIMS = [
     Claim("ppo", "Pendulum-v1", 100_000, -250, seeds=4),
     Claim("ppo", "InvertedPendulum-v5", 100_000, 950, seeds=4),
     Claim("ppo", "CartPoleNoVel-v1", 300_000, 475, seeds=4),
+    Claim("ddpg", "Pendulum-v1", 20_000, -200, seeds=4, items="6.25"),
+    Claim("ddpg", "MountainCarContinuous-v0", 300_000, 92, seeds=4, items="6.26"),
+    Claim("td3", "Pendulum-v1", 20_000, -200, seeds=4, items="6.28"),
+    Claim("sac", "Pendulum-v1", 20_000, -200, seeds=4, items="6.28"),
+    Claim("naf", "Pendulum-v1", 20_000, -200, seeds=4, items="6.24"),
+    Claim("cem_q", "Pendulum-v1", 20_000, -200, seeds=4, items="6.23"),
 ]
 
 

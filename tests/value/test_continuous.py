@@ -18,6 +18,7 @@ from rewardtogo.envs.reward_wrappers import ScaleReward
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
 from rewardtogo.ops import Linear
+from rewardtogo.runner.config import build, describe
 from rewardtogo.value.critics import Critics, from_units, to_units
 from rewardtogo.value.naf import NAFNetwork
 
@@ -229,11 +230,8 @@ def test_td3_moves_actor_and_targets_every_other_update():
     states = [shaken(learner.init(SPEC, KEY))]
     for _ in range(4):
         states.append(step(states[-1], batch()))
-    moved = lambda part, i: (
-        not np.array_equal(
-            jax.tree.leaves(getattr(states[i], part))[0], jax.tree.leaves(getattr(states[i - 1], part))[0]
-        )
-    )
+    first = lambda part, i: jax.tree.leaves(getattr(states[i], part))[0]  # noqa: E731
+    moved = lambda part, i: not np.array_equal(first(part, i), first(part, i - 1))  # noqa: E731
     for part in ("actor", "target_actor", "target_critics"):
         assert [moved(part, i) for i in (1, 2, 3, 4)] == [False, True, False, True], part
     assert all(moved("critics", i) for i in (1, 2, 3, 4))
@@ -256,15 +254,17 @@ def test_td3_without_its_three_mends_is_ddpg():
 
 def test_sac_targets_are_soft(item):
     """With a standard deviation of e^-10 the action is known, and the temperature only adds its share of the entropy."""
-    tight = eqx.tree_at(lambda a: (a.head.weight, a.head.bias), rtg.SAC(network=NET).init(SPEC, KEY).actor,
-                        (0.5 * jnp.ones((4, 5)) * jnp.asarray([[1.0], [1.0], [0.0], [0.0]]), jnp.asarray([0.3, -0.2, -99.0, -99.0])))  # fmt: skip
+    actor = rtg.SAC(network=NET).init(SPEC, KEY).actor
+    weight = 0.5 * jnp.ones((4, 5)) * jnp.asarray([[1.0], [1.0], [0.0], [0.0]])
+    bias = jnp.asarray([0.3, -0.2, -99.0, -99.0])
+    tight = eqx.tree_at(lambda a: (a.head.weight, a.head.bias), actor, (weight, bias))
     found = {}
     for alpha in (1e-9, 0.5):
         learner = rtg.SAC(network=NET, gamma=GAMMA, temperature=alpha, learn_temperature=False)
         state = eqx.tree_at(lambda s: s.actor, shaken(learner.init(SPEC, KEY)), tight)
         # Rewards so large that errors have a known sign.
         b = eqx.tree_at(lambda b: b.transitions.reward, batch(), jnp.asarray(R + 1000.0))
-        new, metrics, priorities = jax.device_get(jit(lambda s, b: learner.update(s, b, KEY))(state, b))  # noqa: B023
+        priorities = np.asarray(jit(lambda s, b: learner.update(s, b, KEY)[2])(state, b))  # noqa: B023
         found[alpha] = priorities + q_of(state.critics, S, UNITS).mean(0)
     outputs = dense(tight.torso.layers, tight.head, NEXT)[:, :2]
     following = q_of(state.target_critics, NEXT, np.tanh(outputs)).min(0)
@@ -396,6 +396,16 @@ def test_critics_read_everything_together():
     bare = Critics.of(rtg.nn.Custom(lambda spec, key: eqx.nn.Linear(3, 4, key=key)), SPEC, KEY, 2)
     q = bare(bare.see((), jnp.ones(3)), jnp.zeros(2)), bare(bare.see((), jnp.ones(3)), jnp.ones(2))
     assert np.any(q[0] != q[1])
+
+
+def test_noises_and_searches_are_plain_data_and_back():
+    learner = rtg.CEMQ(maximiser=rtg.Ascent(3, newton=True), noise=rtg.OU(0.3, dt=0.5))
+    data = describe(learner)
+    assert data["noise"] == {"class": "OU", "sigma": 0.3, "theta": 0.15, "dt": 0.5}
+    again = build(rtg.CEMQ, data)
+    assert describe(again) == data and isinstance(again.maximiser, rtg.Ascent)
+    named = build(rtg.TD3, {"noise": {"class": "ou", "sigma": "linear:0.4:0.1"}})
+    assert named.noise.sigma == Linear(0.4, 0.1)
 
 
 # --- what they learn --------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from rewardtogo.value.operators import (
     greedy_actions,
     q_backup,
 )
-from rewardtogo.value.prioritised_sweeping import prioritised_sweeping
+from rewardtogo.value.sweeping import prioritised_sweeping
 
 SOLVERS: dict[str, Any] = {
     "value_iteration": value_iteration,

@@ -79,13 +79,16 @@ def _draw_step(axes: Axes, step: Step) -> None:
     axes.plot([], [], color=GREEN, ls="--", label="γ times as far: where BV has to be")
     for begin, end, colour in ((step.value, step.backed_up, BLUE), (step.backed_up, step.projected, ORANGE)):
         axes.annotate(
-            "", end, begin, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8, "shrinkA": 4, "shrinkB": 4}
+            "",
+            tuple(end),
+            tuple(begin),
+            arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8, "shrinkA": 4, "shrinkB": 4},
         )
     names = (("V", step.value, INK, (-16, -4)), ("BV", step.backed_up, BLUE, (8, -6)))
     names += (("V' = ΠBV", step.projected, ORANGE, (-62, 4)), ("V*", step.optimum, GREEN, (8, -12)))
     for text, point, colour, offset in names:
         axes.plot(*point, "o", color=colour, ms=6, zorder=5)
-        axes.annotate(text, point, xytext=offset, textcoords="offset points", color=colour, fontsize=11)
+        axes.annotate(text, tuple(point), xytext=offset, textcoords="offset points", color=colour, fontsize=11)
     axes.set(xlabel="value of the first state", ylabel="value of the second state", aspect="equal")
     axes.set(xlim=(-1.45, 2.75), ylim=(-1.75, 2.75))
     axes.set_title("one backup and its projection, γ = 0.9", fontsize=11)

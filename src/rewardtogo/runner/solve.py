@@ -18,7 +18,7 @@ from ..value.dynamic_programming import (
     policy_iteration,
     value_iteration,
 )
-from ..value.prioritised_sweeping import prioritised_sweeping
+from ..value.sweeping import prioritised_sweeping
 
 Sweeping = Callable[..., Solution]
 SWEEPING: dict[str, Sweeping] = {

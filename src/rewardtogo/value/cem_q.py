@@ -38,8 +38,8 @@ from ..core import (
 from ..nn import MLP, Network, Optimiser, RunningNorm, as_network
 from .continuous import Memories, Sample, fit_critics, follow, require_short
 from .critics import Critics, from_units, least, require_box
-from .maximisers import CEM, Maximiser, Maximum
-from .noise import Gaussian, Noise, Noisy
+from .maximisers import CEM, Maximiser, Maximum, as_maximiser
+from .noise import Gaussian, Noise, Noisy, as_noise
 
 
 class CEMQState(eqx.Module):
@@ -85,12 +85,12 @@ class CEMQ(Learner):
     """Q-learning whose best action is searched for. Actions in a box; any observation; networks with or without a memory."""
 
     network: Network = part(MLP(64, 64, activation="relu"), "recipe of the critics", converter=as_network)
-    maximiser: Maximiser = part(CEM(), "how the best action is found: sampled, ascent or cem")
+    maximiser: Maximiser = part(CEM(), "how the best action is found: sampled, ascent or cem", converter=as_maximiser)
     learning_rate: Number = number(1e-3, "Adam's step size", above=0)
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
     target_rate: Number = number(0.005, "tau: how far the targets move towards the critics", above=0, at_most=1)
     critics: int = setting(2, "critics, the least of which counts", at_least=1)
-    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(1000.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")

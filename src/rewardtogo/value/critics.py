@@ -2,9 +2,9 @@ r"""Networks for Q-learning with continuous actions: critics Q(s, a), several si
 
 They work in units of the box: 0 is its centre and -1 and 1 are its bounds, whatever these are.
 
-A feed-forward critic reads observation and action together, so that every layer sees both. Where the recipe has a memory, the memory is
-of observations, and the recipe's decoder reads what is remembered together with the action; a module of the user's own reads the observation, and one
-dense layer of the same width joins its features and the action.
+A feed-forward critic reads observation and action together, so that every layer sees both. Where the recipe has a memory, the
+memory is of observations, and the recipe's decoder reads what is remembered together with the action; a module of the user's own reads
+the observation, and one dense layer of the same width joins its features and the action.
 
 Source: notes 6.3.3; Lillicrap et al. 2016; Fujimoto et al. 2018 (two critics).
 """

@@ -30,7 +30,7 @@ from .continuous import (
     require_short,
 )
 from .critics import require_box
-from .noise import Gaussian, Noise, Noisy
+from .noise import Gaussian, Noise, Noisy, as_noise
 
 
 class DDPG(Learner):
@@ -44,7 +44,7 @@ class DDPG(Learner):
     target_policy: Literal["target", "online"] = setting(
         "target", "which actor chooses the next action in a target", choices=("target", "online")
     )
-    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(1000.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")

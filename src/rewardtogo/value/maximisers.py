@@ -7,12 +7,13 @@ r"""The largest Q(s, a) over continuous actions: by samples, by ascent, by the c
 Each is a function of the function to maximise (of one action), the bounds and a key, and each has a recipe that a learner takes
 (`Sampled`, `Ascent`, `CEM`), in which actions are in units of the box, -1 to 1.
 
-Source: notes 6.3.3 (options 1 of 3). The notes leave step sizes, restarts and elites open; ascent here keeps a step that went up and doubles the
-next one, and undoes one that went down and halves it, which asks for no step size and never ends below its start.
+Source: notes 6.3.3 (the first of its options). The notes leave step sizes, restarts and elites open; ascent here keeps a step that went
+up and doubles the next one, and undoes one that went down and halves it: no step size to choose, and no end below its start.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -61,9 +62,9 @@ def ascended_maximum(
 ) -> Maximum:
     """The best end of `steps` steps up the gradient from each of `starts` uniformly random actions (item 6.22).
 
-    Steps are in units of half the box and end at its faces. With `newton` a step solves (damping I - H) p = g, entries held at a face
-    left out, by as many conjugate gradients as there are entries, and the damping falls after a step up and rises after one down; where the curvature has the wrong
-    sign, conjugate gradients stop at the gradient.
+    Steps are in units of half the box and end at its faces. With `newton` a step solves (damping I - H) p = g, entries held at a face left
+    out, by as many conjugate gradients as there are entries, and the damping falls after a step up and rises after one down. Where the
+    curvature has the wrong sign, conjugate gradients stop at the gradient.
     """
     half = 0.5 * (high - low)
     place = lambda u: low + half * (u + 1.0)  # noqa: E731
@@ -145,6 +146,15 @@ class Maximiser(Configured):
     @abstractmethod
     def __call__(self, value: Value, shape: tuple[int, ...], key: PRNGKey) -> Maximum:
         """The best action between -1 and 1 in each entry, and its value."""
+
+
+def as_maximiser(maximiser: Any) -> Maximiser:
+    """What was given, if it is a maximiser. Raises `ValueError` otherwise."""
+    if not isinstance(maximiser, Maximiser):
+        raise ValueError(
+            f"a maximiser is rtg.Sampled(), rtg.Ascent() or rtg.CEM(), or sampled, ascent or cem by name, not {maximiser!r}"
+        )
+    return maximiser
 
 
 class Sampled(Maximiser):

@@ -4,9 +4,12 @@ r"""NAF: normalised advantage functions (notes 6.3.3, option 2; Gu et al. 2016):
     y       = r + gamma (1 - terminated) V'(s')
     phi     down the mean of (Q(s, a) - y)^2 / 2
 
-L L^T is positive definite, so that argmax_a Q = mu(s) and max_a Q = V(s), exactly. The notes name the method and write nothing down. One torso
-has three heads: V, mu and the entries of L. mu is squashed into the box by tanh where the box is bounded, and free where it is not. It acts by
-mu(s) with noise; networks with a memory learn from sequences.
+L L^T is positive definite, so that argmax_a Q = mu(s) and max_a Q = V(s), exactly. The notes name the method and write nothing down.
+One torso has three heads: V, mu and the entries of L. mu is squashed into the box by tanh where the box is bounded, and free where it
+is not. It acts by mu(s) with noise; networks with a memory learn from sequences.
+
+With errors far beyond 1, all of mu, L and V run in one direction at first, and mu may end at a bound, where tanh has no derivative. So the
+network's outputs are in units of `value_scale` rewards; Q and all that is reported are in rewards, the loss in squares of the unit.
 
 Deviations from the paper: no batch normalisation, one update a step, and no imagination rollouts (which need a model, chapter 10).
 """
@@ -39,7 +42,7 @@ from ..core import (
 from ..nn import MLP, Linear, Network, Optimiser, RunningNorm, Torso, as_network, global_norm
 from .continuous import Memories, Sample, follow, require_short
 from .critics import SMALL, features_along, from_units, over, require_box
-from .noise import Gaussian, Noise, Noisy
+from .noise import Gaussian, Noise, Noisy, as_noise
 
 MOST_LOG_DIAGONAL = 5.0
 """The diagonal of L is at most the exponential of this."""
@@ -51,6 +54,10 @@ class Quadratic(eqx.Module):
     value: Float[Array, ""]
     mean: Float[Array, "A"]
     factor: Float[Array, "A A"]
+
+    def times(self, scale: Number) -> "Quadratic":
+        """The same function times `scale`."""
+        return Quadratic(scale * self.value, self.mean, jnp.sqrt(scale) * self.factor)
 
     def __call__(self, units: Float[Array, "A"]) -> Float[Array, ""]:
         """Q of an action."""
@@ -71,13 +78,10 @@ class NAFNetwork(eqx.Module):
         """Fresh parameters."""
         torso_key, *keys = jax.random.split(key, 4)
         torso, size = network.build(spec.observation, torso_key), spec.action.size
-        heads = [
-            Linear.of(torso.features, outputs, k, gain=SMALL)
-            for outputs, k in zip((1, size, size * (size + 1) // 2), keys, strict=True)
-        ]
+        head = lambda outputs, key: Linear.of(torso.features, outputs, key, gain=SMALL)  # noqa: E731
+        value, mean, factor = head(1, keys[0]), head(size, keys[1]), head(size * (size + 1) // 2, keys[2])
         low, high = spec.action.bounds()
         bounded = tuple(bool(b) for b in (np.isfinite(low) & np.isfinite(high)).ravel())
-        value, mean, factor = heads
         return NAFNetwork(torso, value, mean, factor, bounded)
 
     def read(self, features: Float[Array, "F"]) -> Quadratic:
@@ -113,6 +117,7 @@ class QuadraticPolicy(Policy):
 
     network: NAFNetwork
     norm: RunningNorm | None
+    scale: Float[Array, ""]
     spec: Spec = eqx.field(static=True)
 
     def init(self, key: PRNGKey) -> Carry:
@@ -131,7 +136,7 @@ class QuadraticPolicy(Policy):
     def _look(self, carry: Carry, observation: Observation) -> tuple[Carry, Quadratic]:
         observation = observation if self.norm is None else self.norm(observation)
         memory, features = self.network.torso(carry.actor, observation)
-        return memory, self.network.read(features)
+        return memory, self.network.read(features).times(self.scale)
 
 
 class NAF(Learner):
@@ -139,9 +144,12 @@ class NAF(Learner):
 
     network: Network = part(MLP(256, 256, activation="relu"), "recipe of the network", converter=as_network)
     learning_rate: Number = number(1e-3, "Adam's step size", above=0)
+    value_scale: Number = number(
+        1.0, "rewards that 1 of the network's outputs stands for: about how far returns spread", above=0
+    )
     gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
     target_rate: Number = number(0.005, "tau: how far the target moves towards the network", above=0, at_most=1)
-    noise: Noise = part(Gaussian(0.2), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.2), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
@@ -165,8 +173,9 @@ class NAF(Learner):
         return NAFState(network, network, optimiser, norm, jnp.zeros((), jnp.int32), spec.action)
 
     def policy(self, state: NAFState, explore: bool) -> Policy:
-        policy = QuadraticPolicy(state.network, state.norm, state.spec)
-        return Noisy.of(policy, self.at(state.updates).noise, state.spec) if explore else policy
+        now = self.at(state.updates)
+        policy = QuadraticPolicy(state.network, state.norm, jnp.asarray(now.value_scale, jnp.float32), state.spec)
+        return Noisy.of(policy, now.noise, state.spec) if explore else policy
 
     def update(
         self, state: NAFState, batch: Batch, key: PRNGKey
@@ -176,7 +185,8 @@ class NAF(Learner):
         norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
         sample = Sample.of(batch, state.spec, norm, now.gamma, self.n_step)
         following = state.target.along(sample.memory.actor, sample.t)[1]
-        y = sample.t.reward + sample.discount * following.value
+        # Everything in units of the scale, targets too, so that the loss is as large as the network's outputs are.
+        y = sample.t.reward / now.value_scale + sample.discount * following.value
         units = sample.units.reshape(*sample.t.reward.shape, -1)
 
         def loss(network: NAFNetwork) -> tuple[Array, tuple[Array, Array]]:
@@ -188,7 +198,7 @@ class NAF(Learner):
         (lost, (found, value)), gradient = jax.value_and_grad(loss, has_aux=True)(state.network)
         rule = Optimiser(now.learning_rate, now.max_grad_norm)
         network, optimiser = rule.step(state.network, gradient, state.optimiser)
-        error = jnp.abs(found - y)
+        found, value, error = (now.value_scale * x for x in (found, value, jnp.abs(found - y)))
         metrics = {
             "q_loss": lost,
             "q_mean": found.mean(),

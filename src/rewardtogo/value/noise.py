@@ -3,8 +3,8 @@ r"""Noise on the actions of a deterministic policy, so that it sees what other a
     Gaussian              x_t ~ N(0, sd^2), independent from step to step
     Ornstein-Uhlenbeck    x_{t+1} = x_t - theta x_t dt + sigma sqrt(dt) xi_t,    xi_t ~ N(0, 1)
 
-The second is a first-order autoregression (exact in its own terms, an Euler step of dx = -theta x dt + sigma dW): neighbouring steps have
-the correlation 1 - theta dt, and in the long run its standard deviation is
+The second is a first-order autoregression (an Euler step of dx = -theta x dt + sigma dW): neighbouring steps have the correlation
+1 - theta dt, and in the long run its standard deviation is
 
 $$\frac{\sigma \sqrt{dt}}{\sqrt{1 - (1 - \theta\, dt)^2}},$$
 
@@ -13,10 +13,11 @@ an under-powered system needs to get anywhere. It starts at 0 in each episode, a
 
 All noise is in units of half the width of the action's box, and what is executed (and learnt from) is clipped into the box.
 
-Source: notes 6.3.3; Uhlenbeck and Ornstein 1930; Lillicrap et al. 2016; Fujimoto et al. 2018 (Gaussian noise does as well in MuJoCo's tasks).
+Source: notes 6.3.3; Uhlenbeck and Ornstein 1930; Lillicrap et al. 2016; Fujimoto et al. 2018 (Gaussian noise does as well there).
 """
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -79,6 +80,15 @@ class OU(Noise):
     def stationary_sd(self) -> Float[Array, ""]:
         """Its standard deviation in the long run, the root of Var = (1 - theta dt)^2 Var + sigma^2 dt."""
         return self.sigma * jnp.sqrt(self.dt) / jnp.sqrt(1.0 - (1.0 - self.theta * self.dt) ** 2)
+
+
+def as_noise(noise: Any) -> Noise:
+    """What was given, if it is a noise. Raises `ValueError` otherwise."""
+    if not isinstance(noise, Noise):
+        raise ValueError(
+            f"noise on actions is rtg.Gaussian(0.1) or rtg.OU(0.2), or gaussian or ou by name, not {noise!r}"
+        )
+    return noise
 
 
 class NoisyMemory(eqx.Module):

@@ -15,7 +15,8 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import optax
+from jaxtyping import Array, Bool, Float
 
 from ..core import Batch, EnvSpec, Learner, Number, Policy, PRNGKey, number, part, setting
 from ..nn import MLP, Network, Optimiser, as_network
@@ -29,8 +30,8 @@ from .continuous import (
     improve_actor,
     require_short,
 )
-from .critics import least, require_box
-from .noise import Gaussian, Noise, Noisy
+from .critics import Actor, Critics, least, require_box
+from .noise import Gaussian, Noise, Noisy, as_noise
 
 
 class TD3(Learner):
@@ -45,7 +46,7 @@ class TD3(Learner):
     policy_delay: int = setting(2, "updates of the critics for one of the actor and of all targets", at_least=1)
     smoothing: Number = number(0.2, "sd of the noise on the target's action, in units of half the box", at_least=0)
     smoothing_limit: Number = number(0.5, "this noise is clipped here", at_least=0)
-    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning")
+    noise: Noise = part(Gaussian(0.1), "noise on the actions while learning", converter=as_noise)
     n_step: int = setting(1, "rewards in a target; more come from sequences of at least as many steps", at_least=1)
     max_grad_norm: Number = number(1000.0, "gradients are scaled down to this global norm", above=0)
     normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
@@ -81,39 +82,36 @@ class TD3(Learner):
         seen = state.target_critics.see_along(sample.memory.critics, sample.t)[1]
         y = sample.t.reward + sample.discount * least(state.target_critics(seen, smoothed))
         fit = fit_critics(state.critics, state.critic_optimiser, now._rule(now.learning_rate), sample, y)
-        before = DeterministicState(
-            state.actor,
+        updates = state.updates + 1
+        due = updates % self.policy_delay == 0
+        actor, optimiser = now._improve(state, fit.critics, sample, due)
+        rate = jnp.where(due, now.target_rate, 0.0)
+        state = DeterministicState(
+            actor,
             fit.critics,
-            state.target_actor,
-            state.target_critics,
-            state.actor_optimiser,
+            follow(state.target_actor, actor, rate),
+            follow(state.target_critics, fit.critics, rate),
+            optimiser,
             fit.optimiser,
             norm,
-            state.updates + 1,
+            updates,
             state.spec,
         )
-        metrics = fit.metrics | {"saturation": jnp.abs(chosen).mean()}
-        if self.policy_delay == 1:
-            return now._improve(before, sample), metrics, fit.errors
-        due = before.updates % self.policy_delay == 0
-        improve = lambda s: now._improve(s, sample)  # noqa: E731  (a bound method with traced numbers has no hash)
-        return jax.lax.cond(due, improve, lambda s: s, before), metrics, fit.errors
+        return state, fit.metrics | {"saturation": jnp.abs(chosen).mean()}, fit.errors
 
-    def _improve(self, state: DeterministicState, sample: Sample) -> DeterministicState:
-        """The actor's step, after which all targets move."""
+    def _improve(
+        self, state: DeterministicState, critics: Critics, sample: Sample, due: Bool[Array, ""]
+    ) -> tuple[Actor, optax.OptState]:
+        """The actor and its optimiser after its step, where one is due."""
         rule = self._rule(self.actor_learning_rate)
-        actor, optimiser, _ = improve_actor(state.actor, state.critics, state.actor_optimiser, rule, sample)
-        return DeterministicState(
-            actor,
-            state.critics,
-            follow(state.target_actor, actor, self.target_rate),
-            follow(state.target_critics, state.critics, self.target_rate),
-            optimiser,
-            state.critic_optimiser,
-            state.norm,
-            state.updates,
-            state.spec,
-        )
+
+        def step(old: tuple[Actor, optax.OptState]) -> tuple[Actor, optax.OptState]:
+            actor, optimiser, _ = improve_actor(old[0], critics, old[1], rule, sample)
+            return actor, optimiser
+
+        # Only what changes goes through the condition: what goes through is copied.
+        old = state.actor, state.actor_optimiser
+        return step(old) if self.policy_delay == 1 else jax.lax.cond(due, step, lambda old: old, old)
 
     def _rule(self, rate: Number) -> Optimiser:
         return Optimiser(rate, self.max_grad_norm)
