@@ -99,3 +99,17 @@ def test_other_actions_are_refused(untrained):
 def test_no_run(tmp_path):
     with pytest.raises(ValueError, match="there is no run folder"):
         evaluate_run(tmp_path / "nothing")
+
+
+def test_values_are_compared_with_returns(untrained):
+    """Reward 1 for ever is worth 1 / (1 - gamma), whatever an untrained network thinks of it; discounts that change are refused."""
+    run = untrained("dqn", "TruncatedLoop", gamma=0.3)
+    found = evaluate_run(run, episodes=2, values=True)
+    assert found["value_true"] == pytest.approx(1 / 0.7, rel=0.01)
+    assert abs(found["value_estimated"] - found["value_true"]) > 0.1
+    assert found["value_states"] > 1000
+    unknown = evaluate_run(untrained("dqn", "TruncatedLoop", gamma=0.999), episodes=2, values=True)
+    assert (unknown["value_true"], unknown["value_states"]) == (None, 0)
+    changing = untrained("dqn", "TruncatedLoop", gamma="linear:0.9:0.99")
+    with pytest.raises(ValueError, match="without one fixed discount"):
+        evaluate_run(changing, episodes=2, values=True)
