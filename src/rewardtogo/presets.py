@@ -185,7 +185,17 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "loop": _SMALL_LOOP,
         "learner": {"network": _SMALL, "value_scale": 30.0},
     },
-    ("cem_q", "Pendulum-v1"): {"steps": 20_000, "num_envs": 1, "loop": _SMALL_LOOP, "learner": {"network": _SMALL}},
+    # One critic and a short search: a search in every target is what costs here.
+    ("cem_q", "Pendulum-v1"): {
+        "steps": 20_000,
+        "num_envs": 1,
+        "loop": {**_SMALL_LOOP, "batch_size": 64},
+        "learner": {
+            "network": _SMALL,
+            "critics": 1,
+            "maximiser": {"class": "cem", "iterations": 2, "samples": 16, "elites": 3},
+        },
+    },
     # The usual settings for MuJoCo's tasks (the papers', RL Zoo's); the defaults of the learners are the rest of them.
     ("ddpg", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
     ("td3", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
