@@ -40,10 +40,17 @@ def mdptoolbox(successors, probabilities, rewards, gamma: float, epsilon: float)
         sparse.csr_matrix((probabilities[:, a].ravel(), (rows, successors[:, a].ravel())), (states, states))
         for a in range(actions)
     ]
-    solver = mdp.ValueIteration(matrices, rewards, gamma, epsilon=epsilon)  # checks its input, which is not counted
     began = time.perf_counter()
+    solver = mdp.ValueIteration(matrices, rewards, gamma, epsilon=epsilon)
+    made = time.perf_counter()
     solver.run()
-    return {"seconds": time.perf_counter() - began, "sweeps": solver.iter, "value": float(np.mean(solver.V))}
+    # Making it checks the input and bounds the number of sweeps, which takes longer than the sweeps.
+    return {
+        "seconds": time.perf_counter() - began,
+        "run": time.perf_counter() - made,
+        "sweeps": solver.iter,
+        "value": float(np.mean(solver.V)),
+    }
 
 
 if __name__ == "__main__":
