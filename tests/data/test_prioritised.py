@@ -159,7 +159,9 @@ def test_alpha_0_draws_uniformly_with_weights_1():
 
 def test_beta_follows_its_schedule():
     state, annealed = filled(), rtg.PrioritisedReplay(ROWS * ENVS)
-    loop = rtg.OffPolicy(rtg.vectorize(small_env(), 1), rtg.DQN(network=small), annealed, updates=2).with_horizon(5)
+    loop = rtg.OffPolicy(
+        rtg.vectorize(small_env(), 1), rtg.DQN(network=small), annealed, updates=2, batch_size=8
+    ).with_horizon(5)
     betas = []
     for batches in (0, 5, 10, 99):
         at = dataclasses.replace(state, order=dataclasses.replace(state.order, batches=jnp.asarray(batches, jnp.int32)))

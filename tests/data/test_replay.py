@@ -70,7 +70,7 @@ def test_the_next_observation_of_an_end_is_from_before_the_reset(item):
     wrong, ends = 0, 0
     for limit, ends_by in ((4, "truncated"), (20, "terminated")):
         env = rtg.vectorize(TimeLimit(CountingEnv(9), limit), 2)
-        loop = rtg.OffPolicy(env, Recorder("transitions"), rtg.UniformReplay(64), unroll=3, warm_up=30, batch_size=500)
+        loop = rtg.OffPolicy(env, Recorder("transitions"), rtg.UniformReplay(512), unroll=3, warm_up=30, batch_size=500)
         _, (metrics, _) = jit(lambda key, loop=loop: loop.step(loop.init(key), key))(KEY)
         t = jax.device_get(metrics["batch"].transitions)
         last = t.observation[:, 0] == min(limit, 9) - 1

@@ -279,7 +279,7 @@ def test_a_deep_round_is_a_regression_on_targets_that_stay():
     batch = Batch(t, jnp.arange(2, dtype=jnp.int32), jnp.ones(2))
     update = jit(lambda s: learner.update(s, batch, jax.random.key(0)))
     first = state.target
-    q = lambda n, x: np.asarray(jax.vmap(lambda o: n((), o)[1])(x))  # noqa: E731
+    q = lambda n, x: np.asarray(jax.vmap(lambda o: n((), o)[1])(x))[..., 0]  # noqa: E731
     y = np.array([50.0 + 0.99 * q(first, x[::-1]).max(-1)[0], -1.0])
     for i in range(3):
         before = q(state.network, x)[np.arange(2), [0, 1]]

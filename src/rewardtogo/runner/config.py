@@ -162,8 +162,9 @@ def part_of(where: str, field: dataclasses.Field, value: Any) -> Any:
     kind = type(default).__mro__[1]  # what a part of another class must be too: a network, or a replay
     known = [name for name, cls in PARTS.items() if issubclass(cls, kind)]
     if name not in known:
+        hint = nearest(name, known)
         raise ValueError(
-            f"{where} cannot be a {value['class']!r} by name: {nearest(name, known)} Others are given from Python."
+            f"{where} cannot be {value['class']!r} by name: {hint}{'' if hint.endswith('?') else '.'} Others are given from Python."
         )
     base = describe(default) if PARTS[name] is type(default) else {}
     return build(PARTS[name], base | value)
