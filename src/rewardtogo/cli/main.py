@@ -1,6 +1,7 @@
 """The command `rtg`. Help and lists import no JAX; every wrong request ends with one sentence on stderr and status 2."""
 
 import argparse
+import gc
 import json
 import math
 import os
@@ -265,6 +266,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     # module:Class is looked for where the user stands, too; last, so that no file there hides a library's.
     sys.path.append(os.getcwd())
+    # Imports and tracing make a million objects that stay: looking through them for garbage again and again was a tenth of a short run.
+    gc.set_threshold(100_000, 50, 1000)
     parser, table = _parsers()
     try:
         return _dispatch(parser, table, arguments)
