@@ -132,21 +132,7 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "loop": {"unroll": 4, "updates": 4, "batch_size": 64, "length": 8},
     },
     ("target_q", "CartPole-v1"): _DQN_CARTPOLE,
-    ("per_dqn", "CartPole-v1"): {
-        "steps": 50_000,
-        "num_envs": 1,
-        "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "length": 8},
-        "learner": {
-            "learning_rate": "linear:1e-3:1e-4",
-            "network": {"class": "mlp", "sizes": [64, 64], "activation": "tanh"},
-            "epsilon": "linear:1:0.1:0.12",
-            "n_step": 8,
-            "target_period": 400,
-            "double": True,
-            "huber": 10.0,
-            "max_grad_norm": 100.0,
-        },
-    },
+    ("per_dqn", "CartPole-v1"): _DQN_CARTPOLE,
     # The settings that published code shares (batches of 32 every 4 steps, a target every 1000, Adam at 1e-4), with a replay that most
     # machines can hold: 0.8 GB. Two cores are too slow to train a game to its end, so that no score of ours stands behind it.
     ("dqn", "ALE/*"): {

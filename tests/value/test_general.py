@@ -14,8 +14,8 @@ from algorithms_under_test import jit
 from rewardtogo.core import Transition
 from rewardtogo.envs.tabular import MDP, TabularEnv
 from rewardtogo.figures import q_processes
+from rewardtogo.nn.optimise import towards
 from rewardtogo.value import general
-from rewardtogo.value.targets import towards
 
 KEY = jax.random.key(0)
 GAMMA, RATE = 0.5, 0.125

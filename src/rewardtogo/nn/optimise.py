@@ -3,6 +3,7 @@
 from typing import TypeVar, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
@@ -56,3 +57,8 @@ def global_norm(tree: Parameters) -> Float[Array, ""]:
     """Euclidean norm of all the numbers in a tree."""
     # As one vector, which `Optimiser` makes of it anyway: the compiler computes the norm once.
     return jnp.sqrt(jnp.sum(jnp.square(ravel_pytree(tree)[0])))
+
+
+def towards(target: Parameters, network: Parameters, tau: Number) -> Parameters:
+    """The rule phi' <- (1 - tau) phi' + tau phi: where the target network moves; at tau = 1 exactly to the network."""
+    return jax.tree.map(lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), target, network)

@@ -36,7 +36,8 @@ from ..core import (
     setting,
 )
 from ..nn import MLP, Network, Optimiser, RunningNorm, as_network
-from .continuous import Memories, Sample, fit_critics, follow, require_short
+from ..nn.optimise import towards
+from .continuous import Memories, Sample, fit_critics, require_short
 from .critics import Critics, from_units, least, require_box
 from .maximisers import CEM, Maximiser, Maximum, as_maximiser
 from .noise import Gaussian, Noise, Noisy, as_noise
@@ -127,7 +128,7 @@ class CEMQ(Learner):
         y = sample.t.reward + sample.discount * best.value
         rule = Optimiser(now.learning_rate, now.max_grad_norm)
         fit = fit_critics(state.critics, state.optimiser, rule, sample, y)
-        target = follow(state.target_critics, fit.critics, now.target_rate)
+        target = towards(state.target_critics, fit.critics, now.target_rate)
         state = CEMQState(fit.critics, target, fit.optimiser, norm, state.updates + 1, state.spec)
         return state, fit.metrics | {"saturation": jnp.abs(best.action).mean()}, fit.errors
 

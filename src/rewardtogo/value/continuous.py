@@ -10,7 +10,6 @@ Source: notes 6.3.3; Lillicrap et al. 2016; Fujimoto et al. 2018.
 """
 
 import dataclasses
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -21,10 +20,9 @@ from jaxtyping import Array, Float, Int
 from ..core import Action, Batch, Carry, EnvSpec, Number, Observation, Policy, PRNGKey, Spec, Transition
 from ..data.n_step import DISCOUNT, n_step_windows
 from ..nn import Network, Optimiser, RunningNorm, global_norm
-from .critics import Actor, Critics, from_units, least, over, to_units
+from ..ops.axes import over
+from .critics import Actor, Critics, from_units, least, to_units
 from .noise import NoisyMemory
-
-Parameters = TypeVar("Parameters")
 
 
 def require_short(network: Network, n_step: int) -> None:
@@ -133,11 +131,6 @@ def improve_actor(
     value, gradient = jax.value_and_grad(loss)(actor)
     actor, optimiser = rule.step(actor, gradient, optimiser)
     return actor, optimiser, value
-
-
-def follow(target: Parameters, online: Parameters, rate: Number) -> Parameters:
-    """The target after a move of `rate` of the way towards the online parameters; 1 copies them to the bit."""
-    return jax.tree.map(lambda old, new: jnp.where(rate == 1.0, new, old + rate * (new - old)), target, online)
 
 
 class DeterministicState(eqx.Module):

@@ -11,8 +11,6 @@ Source: notes 6.3.3; Lillicrap et al. 2016; Fujimoto et al. 2018 (two critics).
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,18 +21,12 @@ from jaxtyping import Array, Float
 from ..core import MASK, Carry, EnvSpec, Observation, PRNGKey, Spec, Transition, require_action
 from ..nn import GRU, LSTM, MLP, Custom, Linear, Network, Torso, is_recurrent, unroll
 from ..nn.heads import centre, half_width
+from ..ops.axes import over
 
 SMALL = 0.01
 """Gain of last layers: the first actions are near the middle of the box, and the first values near 0."""
 PAIR = "action", "observation"
 """Names of the two things that a critic reads together, in the order in which they are laid beside each other."""
-
-
-def over(axes: int, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one step mapped over `axes` leading axes."""
-    for _ in range(axes):
-        function = jax.vmap(function)
-    return function
 
 
 # --- boxes ------------------------------------------------------------------------------------------------------------

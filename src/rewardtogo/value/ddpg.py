@@ -19,13 +19,13 @@ from jaxtyping import Array, Float
 
 from ..core import Batch, EnvSpec, Learner, Number, Policy, PRNGKey, number, part, setting
 from ..nn import MLP, Network, Optimiser, as_network
+from ..nn.optimise import towards
 from .continuous import (
     DeterministicState,
     GreedyActor,
     Sample,
     deterministic,
     fit_critics,
-    follow,
     improve_actor,
     require_short,
 )
@@ -86,8 +86,8 @@ class DDPG(Learner):
         state = DeterministicState(
             actor,
             fit.critics,
-            follow(state.target_actor, actor, now.target_rate),
-            follow(state.target_critics, fit.critics, now.target_rate),
+            towards(state.target_actor, actor, now.target_rate),
+            towards(state.target_critics, fit.critics, now.target_rate),
             optimiser,
             fit.optimiser,
             norm,

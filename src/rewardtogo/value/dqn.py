@@ -35,11 +35,13 @@ from jaxtyping import Array, Float, Int
 from ..core import Batch, EnvSpec, Learner, Number, PRNGKey, Transition, number, part, require_action, setting
 from ..data.n_step import IMPORTANCE, n_step_windows
 from ..nn import MLP, RULES, Network, Optimiser, RunningNorm, as_network, global_norm
+from ..nn.optimise import towards
+from ..ops.axes import over
 from ..ops.retrace import TRACES, Trace
 from ..ops.schedules import Linear as LinearSchedule
 from .outputs import Expectation, Outputs
-from .q_network import GreedyPolicy, QNetwork, expected, over
-from .targets import CORRECTIONS, Correction, bootstrapped, corrections, look, outputs_at, towards, traced
+from .q_network import GreedyPolicy, QNetwork, expected
+from .targets import CORRECTIONS, Correction, bootstrapped, corrections, look, outputs_at, traced
 
 
 class DQNState(eqx.Module):

@@ -40,8 +40,10 @@ from ..core import (
     setting,
 )
 from ..nn import MLP, Linear, Network, Optimiser, RunningNorm, Torso, as_network, global_norm
-from .continuous import Memories, Sample, follow, require_short
-from .critics import SMALL, features_along, from_units, over, require_box
+from ..nn.optimise import towards
+from ..ops.axes import over
+from .continuous import Memories, Sample, require_short
+from .critics import SMALL, features_along, from_units, require_box
 from .noise import Gaussian, Noise, Noisy, as_noise
 
 MOST_LOG_DIAGONAL = 5.0
@@ -207,6 +209,6 @@ class NAF(Learner):
             "advantage": (found - value).mean(),
             "saturation": jnp.abs(following.mean).mean(),
         }
-        target = follow(state.target, network, now.target_rate)
+        target = towards(state.target, network, now.target_rate)
         state = NAFState(network, target, optimiser, norm, state.updates + 1, state.spec)
         return state, metrics, sample.by_sample(error)

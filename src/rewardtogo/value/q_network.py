@@ -4,9 +4,6 @@ A *dueling* head (Wang et al. 2016) has two streams, $Q(s, a) = V(s) + A(s, a) -
 is worth is learned from every action. In a *noisy* head (`nn.noisy`) the weights are random while acting and learning.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,17 +11,11 @@ from jaxtyping import Array, Bool, Float, ScalarLike
 
 from ..core import Action, Carry, EnvSpec, Observation, Policy, PRNGKey, Transition
 from ..nn import Linear, Network, NoisyLinear, RunningNorm, Torso, action_mask, is_recurrent, perturbed, unroll
+from ..ops.axes import over
 from .outputs import Outputs
 
 FORBIDDEN = -1e9
 """The Q value of a masked action: finite, so that nothing multiplied by 0 becomes NaN."""
-
-
-def over(axes: int, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of one step mapped over `axes` leading axes."""
-    for _ in range(axes):
-        function = jax.vmap(function)
-    return function
 
 
 class QHead(eqx.Module):

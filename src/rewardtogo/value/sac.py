@@ -38,9 +38,11 @@ from ..core import (
     setting,
 )
 from ..nn import MLP, Network, Optimiser, RunningNorm, as_network
+from ..nn.optimise import towards
+from ..ops.axes import over
 from ..ops.distributions import TanhGaussian
-from .continuous import Memories, Sample, fit_critics, follow, require_short
-from .critics import Actor, Critics, from_units, least, over, require_box
+from .continuous import Memories, Sample, fit_critics, require_short
+from .critics import Actor, Critics, from_units, least, require_box
 
 LEAST_LOG_STD, MOST_LOG_STD = -10.0, 2.0
 """The logarithm of the standard deviation, before squashing, is clipped to these."""
@@ -169,7 +171,7 @@ class SAC(Learner):
         state = SACState(
             actor,
             fit.critics,
-            follow(state.target_critics, fit.critics, now.target_rate),
+            towards(state.target_critics, fit.critics, now.target_rate),
             log_temperature,
             actor_optimiser,
             fit.optimiser,

@@ -21,9 +21,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..core import Number, Observation, Transition
 from ..data.n_step import DISCOUNT
+from ..ops.axes import over
 from ..ops.retrace import Trace, retrace, trace_coefficients
 from .outputs import Outputs
-from .q_network import QNetwork, allowed_only, expected, greedy_probabilities, over
+from .q_network import QNetwork, allowed_only, expected, greedy_probabilities
 
 Correction = Literal["none", "adaptive", "importance"]
 CORRECTIONS = ("none", "adaptive", "importance")
@@ -77,11 +78,6 @@ def behaviour(t: Transition) -> Float[Array, "*N"]:
             "use data of this library's own policies, kept in a replay, or traces='tree_backup', which needs none"
         )
     return t.extras["log_prob"]
-
-
-def towards(target: Parameters, network: Parameters, tau: Number) -> Parameters:
-    """The rule phi' <- (1 - tau) phi' + tau phi: where the target network moves; at tau = 1 exactly to the network."""
-    return jax.tree.map(lambda old, new: jnp.where(tau == 1.0, new, old + tau * (new - old)), target, network)
 
 
 def at_action(values: Float[Array, "*N A"], action: Array) -> Float[Array, "*N"]:

@@ -20,13 +20,13 @@ from jaxtyping import Array, Bool, Float
 
 from ..core import Batch, EnvSpec, Learner, Number, Policy, PRNGKey, number, part, setting
 from ..nn import MLP, Network, Optimiser, as_network
+from ..nn.optimise import towards
 from .continuous import (
     DeterministicState,
     GreedyActor,
     Sample,
     deterministic,
     fit_critics,
-    follow,
     improve_actor,
     require_short,
 )
@@ -89,8 +89,8 @@ class TD3(Learner):
         state = DeterministicState(
             actor,
             fit.critics,
-            follow(state.target_actor, actor, rate),
-            follow(state.target_critics, fit.critics, rate),
+            towards(state.target_actor, actor, rate),
+            towards(state.target_critics, fit.critics, rate),
             optimiser,
             fit.optimiser,
             norm,
