@@ -136,7 +136,9 @@ def once(contender: Contender) -> Result:
         return {"error": f"not installed: {reason}"}
     if contender.before:
         contender.before()
-    environment = {**os.environ, "PYTHONWARNINGS": "ignore", "TF_CPP_MIN_LOG_LEVEL": "3", **contender.environment}
+    # An installed library has its bytecode, whatever this machine wants of a checkout.
+    quiet = {"PYTHONWARNINGS": "ignore", "TF_CPP_MIN_LOG_LEVEL": "3", "PYTHONDONTWRITEBYTECODE": ""}
+    environment = {**os.environ, **quiet, **contender.environment}
     started = time.perf_counter()
     done = subprocess.run(contender.command(), capture_output=True, text=True, cwd=ROOT, env=environment)
     seconds = time.perf_counter() - started

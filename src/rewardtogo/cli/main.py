@@ -1,6 +1,7 @@
 """The command `rtg`. Help and lists import no JAX; every wrong request ends with one sentence on stderr and status 2."""
 
 import argparse
+import atexit
 import gc
 import json
 import math
@@ -268,6 +269,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.path.append(os.getcwd())
     # Imports and tracing make a million objects that stay: looking through them for garbage again and again was a tenth of a short run.
     gc.set_threshold(100_000, 50, 1000)
+    # Nor is there anything to gain from a last look at them, which takes half a second.
+    atexit.register(gc.freeze)
     parser, table = _parsers()
     try:
         return _dispatch(parser, table, arguments)

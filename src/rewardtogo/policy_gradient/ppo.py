@@ -123,13 +123,14 @@ class PPO(Learner):
             loop: tuple[ActorCritic, optax.OptState], rows: Int[Array, "M"]
         ) -> tuple[tuple[ActorCritic, optax.OptState], dict[str, Array]]:
             network, optimiser = loop
-            # One minibatch is the whole rollout, in whatever order.
             chosen = samples if self.minibatches == 1 else jax.tree.map(lambda x: x[rows], samples)
             gradient, metrics = jax.grad(now._loss, has_aux=True)(network, chosen, state.multiplier)
             return now._optimiser().step(network, gradient, optimiser), metrics | {"grad_norm": global_norm(gradient)}
 
         used = self.minibatches * per_minibatch
-        shuffled = permutations(key, self.epochs, size)[:, :used]
+        # One minibatch is the whole rollout, in whatever order: nothing is shuffled.
+        whole = jnp.broadcast_to(jnp.arange(size), (self.epochs, size))
+        shuffled = whole if self.minibatches == 1 else permutations(key, self.epochs, size)[:, :used]
         loop = (state.network, state.optimiser)
         (network, optimiser), metrics = jax.lax.scan(minibatch, loop, shuffled.reshape(-1, per_minibatch))
         # Statistics change after the update, so that the ratio starts at exactly 1.
