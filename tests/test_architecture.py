@@ -270,7 +270,9 @@ def abstract_methods(cls: Name | str) -> set[str]:
 
 
 def fields_of(cls: Name) -> list[str]:
-    return [ast.unparse(node.target) for node in CLASSES[cls].body if isinstance(node, ast.AnnAssign)]
+    """Its own fields; an `AbstractVar` is a promise of one, not one."""
+    own = [node for node in CLASSES[cls].body if isinstance(node, ast.AnnAssign)]
+    return [ast.unparse(node.target) for node in own if "AbstractVar" not in ast.unparse(node.annotation)]
 
 
 MODULES = [cls for cls in CLASSES if is_module(cls)]

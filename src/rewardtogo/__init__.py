@@ -123,6 +123,7 @@ _ROOMS = (
     "loops",
     "nn",
     "ops",
+    "planning",
     "policy_gradient",
     "runner",
     "value",

@@ -11,6 +11,7 @@ from .protocols import Algorithm as Algorithm
 from .protocols import Environment as Environment
 from .protocols import Learner as Learner
 from .protocols import Model as Model
+from .protocols import Observed as Observed
 from .protocols import Policy as Policy
 from .protocols import Solution as Solution
 from .protocols import VectorEnv as VectorEnv

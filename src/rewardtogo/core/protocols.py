@@ -40,6 +40,14 @@ class Environment(eqx.Module):
         """Take one action. Without a reset, `observation` and `final_observation` are the same."""
 
 
+class Observed(Environment):
+    """An environment whose observation tells its whole state, so that one can plan from what is seen."""
+
+    @abstractmethod
+    def state_of(self, observation: Observation) -> State:
+        """The state that looks like this."""
+
+
 class VectorEnv(eqx.Module):
     """B environments side by side, which reset themselves: `Timestep.observation` opens the next episode where one ended."""
 

@@ -8,6 +8,8 @@ from .gymnasium import EnvironmentFailure as EnvironmentFailure
 from .gymnasium import GymnasiumEnv as GymnasiumEnv
 from .history import DiscreteHistory as DiscreteHistory
 from .history import History as History
+from .known import KnownModel as KnownModel
+from .known import Simulation as Simulation
 from .mountain_car import MountainCar as MountainCar
 from .mountain_car import MountainCarContinuous as MountainCarContinuous
 from .pendulum import Pendulum as Pendulum

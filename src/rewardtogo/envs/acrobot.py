@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
+from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
 
 GRAVITY = 9.8
 LINK_MASS = 1.0
@@ -26,7 +26,7 @@ MAX_SPIN_2 = 9 * np.pi
 TIP_HEIGHT = 1.0
 
 
-class Acrobot(Environment):
+class Acrobot(Observed):
     """Two links. Actions: torque -1, 0, 1.
 
     - State: two angles (rad, 0 hanging, the second relative to the first), two angular velocities (rad/s).
@@ -45,6 +45,10 @@ class Acrobot(Environment):
     def reset(self, key: PRNGKey) -> tuple[State, Observation]:
         state = jax.random.uniform(key, (4,), minval=-0.1, maxval=0.1)
         return state, observe(state)
+
+    def state_of(self, observation: Observation) -> State:
+        cosine_1, sine_1, cosine_2, sine_2, *spins = jnp.asarray(observation)
+        return jnp.stack([jnp.arctan2(sine_1, cosine_1), jnp.arctan2(sine_2, cosine_2), *spins])
 
     def step(self, state: State, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
+from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
 
 GRAVITY = 9.8
 CART_MASS = 1.0
@@ -21,7 +21,7 @@ X_LIMIT = 2.4
 ANGLE_LIMIT = 12 * 2 * np.pi / 360
 
 
-class CartPole(Environment):
+class CartPole(Observed):
     """State and observation: position (m), velocity (m/s), pole angle (rad), angular velocity (rad/s). Actions: 0 left, 1 right."""
 
     @property
@@ -36,6 +36,9 @@ class CartPole(Environment):
     def reset(self, key: PRNGKey) -> tuple[State, Observation]:
         state = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
         return state, state
+
+    def state_of(self, observation: Observation) -> State:
+        return jnp.asarray(observation)
 
     def step(self, state: State, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
+from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
 
 MIN_POSITION = -1.2
 MAX_POSITION = 0.6
@@ -25,7 +25,7 @@ GOAL_REWARD = 100.0
 FORCE_COST = 0.1
 
 
-class MountainCar(Environment):
+class MountainCar(Observed):
     """State and observation: position and velocity. Actions: 0 push left, 1 nothing, 2 push right."""
 
     @property
@@ -40,6 +40,9 @@ class MountainCar(Environment):
         state = _start(key)
         return state, state
 
+    def state_of(self, observation: Observation) -> State:
+        return jnp.asarray(observation)
+
     def step(self, state: State, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key
         state = drive(state, (jnp.asarray(action, state.dtype) - 1.0) * PUSH)
@@ -48,7 +51,7 @@ class MountainCar(Environment):
         return state, Timestep(state, reward, terminated, jnp.zeros((), bool), state, {})
 
 
-class MountainCarContinuous(Environment):
+class MountainCarContinuous(Observed):
     """State and observation: position and velocity. Action: a force in [-1, 1].
 
     A force outside is clipped and yet costs what was asked for, as in Gymnasium.
@@ -65,6 +68,9 @@ class MountainCarContinuous(Environment):
     def reset(self, key: PRNGKey) -> tuple[State, Observation]:
         state = _start(key)
         return state, state
+
+    def state_of(self, observation: Observation) -> State:
+        return jnp.asarray(observation)
 
     def step(self, state: State, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
+from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
 
 GRAVITY = 10.0
 MASS = 1.0
@@ -20,7 +20,7 @@ MAX_SPIN = 8.0
 MAX_TORQUE = 2.0
 
 
-class Pendulum(Environment):
+class Pendulum(Observed):
     """One rod. Action: a torque in [-2, 2].
 
     - State: angle (rad, not wrapped), angular velocity (rad/s).
@@ -39,6 +39,10 @@ class Pendulum(Environment):
     def reset(self, key: PRNGKey) -> tuple[State, Observation]:
         state = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0) * jnp.asarray([np.pi, 1.0])
         return state, observe(state)
+
+    def state_of(self, observation: Observation) -> State:
+        cosine, sine, spin = jnp.asarray(observation)
+        return jnp.stack([jnp.arctan2(sine, cosine), spin])
 
     def step(self, state: State, action: Action, key: PRNGKey) -> tuple[State, Timestep]:
         del key
