@@ -1,15 +1,14 @@
 """Behavioural cloning: items 2.1 and 2.2, its loss by hand, memories, masks, refusals."""
 
-from functools import partial
-
 import equinox as eqx
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from imitating import run, spec_of, steps
 
-from rewardtogo.core import Batch, Carry, EnvSpec, Observation, Policy, PRNGKey, Transition, from_space
+from rewardtogo.core import Batch, Carry, EnvSpec, Observation, Policy, PRNGKey
 from rewardtogo.data import Dataset
 from rewardtogo.data.noise import EXPERT
 from rewardtogo.envs.registry import make
@@ -19,34 +18,6 @@ from rewardtogo.nn import GRU, MLP
 from rewardtogo.ops.schedules import Linear
 from rewardtogo.runner.collect import play
 from rewardtogo.runner.evaluate import Evaluator
-
-
-def steps(observation, action, spec: EnvSpec, length: int = 10, extras=None) -> Dataset:
-    """A dataset of episodes of `length` steps in which one observation leads to the next."""
-    size = len(jax.tree.leaves(action)[0])
-    end = jnp.arange(size) % length == length - 1
-    following = jax.tree.map(lambda x: jnp.roll(x, -1, 0), observation)
-    t = Transition(observation, action, jnp.zeros(size), jnp.zeros(size, bool), end | (jnp.arange(size) == size - 1),
-                   following, extras or {})  # fmt: skip
-    return Dataset.of(t, spec)
-
-
-@partial(jax.jit, static_argnames="iterations")
-def _fit(algorithm: Offline, key, iterations: int):
-    state, keys = algorithm.init(key), jax.random.split(key, iterations)
-    return jax.lax.scan(lambda s, k: algorithm.step(s, k), state, keys)
-
-
-def run(algorithm: Offline, key, iterations: int):
-    """State and metrics by iteration, all in one program."""
-    fit = partial(_fit, iterations=iterations)
-    fit = fit if key.ndim == 0 else jax.vmap(fit, in_axes=(None, 0))
-    state, (metrics, _) = fit(algorithm.with_horizon(iterations), key)
-    return state, metrics
-
-
-def spec_of(observation: spaces.Space, action: spaces.Space) -> EnvSpec:
-    return EnvSpec(from_space(observation), from_space(action))
 
 
 def fresh(learner: BC, spec: EnvSpec, key):

@@ -5,6 +5,9 @@ Minimises over batches of an expert's data, with c_H the weight of an entropy bo
     nll   -mean log pi(a* | o) - c_H mean H(pi(. | o))         cross-entropy for choices, Gaussian likelihood for boxes
     mse    mean ((a* - mu(o)) / h)^2,    h half the box        boxes only; equal to nll where the spread is fixed
 
+where pi is what the head makes of the network's features: the usual law of the space, or one with several peaks (`nn/heads.py`;
+of a head with a hidden variable, log pi is replaced by its lower bound),
+
 and acts by sampling from pi (`mse`: by mu) to explore, otherwise by its mode. Where noise was put on a demonstrator's
 actions, a* is what it chose, not what was done (`extras["expert_action"]`). A network with a memory learns from windows
 of consecutive steps, its memory reset at the end of each episode inside.
@@ -20,7 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int, Key
 
 from ..core import (
     Action,
@@ -28,7 +32,9 @@ from ..core import (
     EnvSpec,
     Learner,
     Number,
+    Observation,
     PRNGKey,
+    Schedule,
     Transition,
     number,
     part,
@@ -36,9 +42,9 @@ from ..core import (
     setting,
 )
 from ..data.noise import EXPERT
-from ..nn import ACTION_KINDS, MLP, Network, RunningNorm, as_network
+from ..nn import MLP, Network, RunningNorm, action_mask, as_network
 from ..nn.actor import ActorNetwork, StochasticPolicy
-from ..nn.heads import half_width
+from ..nn.heads import ActionHead, HeadRecipe, Standard, half_width
 from ..nn.optimise import Optimiser, global_norm
 from ..ops.distributions import Distribution
 
@@ -55,11 +61,13 @@ class BCState(eqx.Module):
 class Fit(eqx.Module):
     """How well the policy explains an expert's actions, by sample: `[N]`, or `[T, N]` in sequences.
 
+    - `loss`: what the head minimises, -log pi or a bound above it.
+    - `entropy`: of the policy; where it has no closed form, -log pi of one sample.
     - `agreement`: how many entries of the likeliest action are the expert's, from 0 to 1; 0 in boxes.
     - `square`: squared distance of the likeliest action in units of half the box, mean over entries; 0 for choices.
     """
 
-    log_prob: Float[Array, "*N"]
+    loss: Float[Array, "*N"]
     entropy: Float[Array, "*N"]
     agreement: Float[Array, "*N"]
     square: Float[Array, "*N"]
@@ -69,6 +77,7 @@ class BC(Learner):
     """Behavioural cloning. Any action space but dictionaries; any observation; networks with or without a memory."""
 
     network: Network = part(MLP(64, 64), "recipe of the policy's network", converter=as_network)
+    head: HeadRecipe = part(Standard(), "law of the action: standard, mixture, autoregressive or latent")
     learning_rate: Number = number(1e-3, "Adam's step size", above=0)
     entropy_cost: Number = number(0.0, "c_H: weight of the entropy bonus, for nll", at_least=0)
     weight_decay: Number = number(0.0, "AdamW's pull of every parameter towards 0", at_least=0)
@@ -83,13 +92,19 @@ class BC(Learner):
 
     @property
     def action_kinds(self) -> tuple[str, ...]:
-        return ACTION_KINDS
+        return self.head.action_kinds
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> BCState:
         require_action("BC", spec, self.action_kinds)
         if self.loss == "mse" and spec.action.kind != "box":
             raise ValueError(f"a squared error needs actions that are boxes, and these are {spec.action.kind}: use nll")
-        network = ActorNetwork.of(self.network, spec, key)
+        if self.loss == "mse" and not isinstance(self.head, Standard):
+            raise ValueError("a squared error is that of one mean, which this head does not have: use nll")
+        if not isinstance(self.head, Standard) and self._has_bonus():
+            raise ValueError(
+                "an entropy bonus needs a law whose entropy is known: use the head standard, or entropy_cost 0"
+            )
+        network = ActorNetwork.of(self.network, spec, key, self.head)
         norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
         zero = jnp.zeros((), jnp.int32)
         return BCState(network, self.at(zero)._optimiser().init(network), norm, zero)
@@ -98,21 +113,21 @@ class BC(Learner):
         return StochasticPolicy(state.network, state.norm, explore and self.loss == "nll")
 
     def update(self, state: BCState, batch: Batch, key: PRNGKey) -> tuple[BCState, dict[str, Array], tuple[()]]:
-        del key
         t = batch.transitions
         norm = None if state.norm is None else state.norm.update(t.observation)
         now = self.at(state.updates)
 
         def loss(network: ActorNetwork) -> tuple[Array, Fit]:
-            fit = explain(network, norm, t)
-            by_step = fit.square if self.loss == "mse" else -fit.log_prob - now.entropy_cost * fit.entropy
+            fit = explain(network, norm, t, key)
+            by_step = fit.square if self.loss == "mse" else fit.loss - now.entropy_cost * fit.entropy
             by_sample = by_step if by_step.ndim == 1 else by_step.mean(0)
             return (batch.weights * by_sample).mean(), fit
 
         (value, fit), gradient = jax.value_and_grad(loss, has_aux=True)(state.network)
         network, optimiser = now._optimiser().step(state.network, gradient, state.optimiser)
         decay = now.learning_rate * now.weight_decay
-        network = now._with_floor(jax.tree.map(lambda new, old: new - decay * old, network, state.network))
+        network = jax.tree.map(lambda new, old: new - decay * old, network, state.network)
+        network = eqx.tree_at(lambda n: n.head, network, network.head.with_least_std(self.min_std))
         metrics = {"bc_loss": value, "entropy": fit.entropy.mean(), "grad_norm": global_norm(gradient)}
         if network.head.spec.kind == "box":
             metrics["mse"] = fit.square.mean()
@@ -120,36 +135,48 @@ class BC(Learner):
             metrics["accuracy"] = fit.agreement.mean()
         return BCState(network, optimiser, norm, state.updates + 1), metrics, ()
 
-    def _with_floor(self, network: ActorNetwork) -> ActorNetwork:
-        if network.head.spec.kind != "box":
-            return network
-        floor = jnp.log(self.min_std * half_width(network.head.spec))
-        return eqx.tree_at(lambda n: n.head.log_std, network, jnp.maximum(network.head.log_std, floor))
+    def _has_bonus(self) -> bool:
+        """Whether there is an entropy bonus, as far as can be known while tracing."""
+        cost = self.entropy_cost
+        return isinstance(cost, Schedule) or (not isinstance(cost, Tracer) and bool(np.any(np.asarray(cost) != 0.0)))
 
     def _optimiser(self) -> Optimiser:
         return Optimiser(self.learning_rate, self.max_grad_norm)
 
 
-def explain(network: ActorNetwork, norm: RunningNorm | None, t: Transition) -> Fit:
-    """How well a policy explains an expert's transitions `[N]`, or with a memory sequences `[T, N]`."""
+def explain(network: ActorNetwork, norm: RunningNorm | None, t: Transition, key: PRNGKey) -> Fit:
+    """How well a policy explains an expert's transitions `[N]`, or with a memory sequences `[T, N]`.
+
+    `key` is for heads whose loss is itself a sample.
+    """
     action = t.extras.get(EXPERT, t.action)
     standard = (lambda x: x) if norm is None else norm
-    compare = lambda d, a: _compare(d, a, half_width(network.head.spec))  # noqa: E731
+    keys = jax.random.split(key, t.reward.shape)
+
+    def compare(features: Array, observation: Observation, action: Action, key: PRNGKey) -> Fit:
+        mask = action_mask(observation)
+        loss_key, sample_key = jax.random.split(key)
+        loss = network.head.loss(features, action, loss_key, mask)
+        law = network.head(features, mask)
+        known = isinstance(network.head, ActionHead)
+        entropy = law.entropy() if known else -jax.lax.stop_gradient(law.sample_and_log_prob(sample_key)[1])
+        return Fit(loss, entropy, *_distance(law, action, half_width(network.head.spec)))
+
     if not network.recurrent:
-        one = lambda o, a: compare(network(network.init(), standard(o))[1], a)  # noqa: E731
-        return jax.vmap(one)(t.observation, action)
+        features = lambda o: network.torso(network.init(), standard(o))[1]  # noqa: E731
+        return jax.vmap(lambda o, a, k: compare(features(o), o, a, k))(t.observation, action, keys)
 
-    def sequence(t: Transition, action: Action) -> Fit:
+    def sequence(t: Transition, action: Action, keys: Key[Array, "T"]) -> Fit:
         first = jax.tree.map(lambda x: x[0], t.extras["carry"])
-        return jax.vmap(compare)(network.along(first, jax.vmap(standard)(t.observation), t.done), action)
+        features = network.features_along(first, jax.vmap(standard)(t.observation), t.done)
+        return jax.vmap(compare)(features, t.observation, action, keys)
 
-    return jax.vmap(sequence, in_axes=1, out_axes=1)(t, action)
+    return jax.vmap(sequence, in_axes=1, out_axes=1)(t, action, keys)
 
 
-def _compare(distribution: Distribution, action: Action, unit: np.ndarray) -> Fit:
-    likeliest = distribution.mode()
+def _distance(law: Distribution, action: Action, unit: np.ndarray) -> tuple[Array, Array]:
+    """Agreement and squared distance of the likeliest action and the expert's."""
+    likeliest = law.mode()
     if jnp.issubdtype(likeliest.dtype, jnp.integer):
-        agreement, square = (likeliest == action).astype(jnp.float32).mean(), jnp.zeros(())
-    else:
-        agreement, square = jnp.zeros(()), jnp.square((likeliest - action) / unit).mean()
-    return Fit(distribution.log_prob(action), distribution.entropy(), agreement, square)
+        return (likeliest == action).astype(jnp.float32).mean(), jnp.zeros(())
+    return jnp.zeros(()), jnp.square((likeliest - action) / unit).mean()

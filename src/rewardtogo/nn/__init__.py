@@ -4,6 +4,7 @@ from .actor_critic import VERSION as VERSION
 from .actor_critic import ActorCritic as ActorCritic
 from .actor_critic import ActorCriticPolicy as ActorCriticPolicy
 from .actor_critic import require_fresh as require_fresh
+from .autoregressive import Autoregressive as Autoregressive
 from .encoding import RunningNorm as RunningNorm
 from .encoding import action_mask as action_mask
 from .encoding import flat_size as flat_size
@@ -11,6 +12,11 @@ from .encoding import flatten_observation as flatten_observation
 from .encoding import has_images as has_images
 from .heads import ACTION_KINDS as ACTION_KINDS
 from .heads import ActionHead as ActionHead
+from .heads import Head as Head
+from .heads import HeadRecipe as HeadRecipe
+from .heads import Standard as Standard
+from .latent import Latent as Latent
+from .mixture import Mixture as Mixture
 from .network import CNN as CNN
 from .network import MLP as MLP
 from .network import Custom as Custom
@@ -29,3 +35,4 @@ from .recurrent import is_recurrent as is_recurrent
 from .recurrent import piece_length as piece_length
 from .recurrent import pieces as pieces
 from .recurrent import unroll as unroll
+from .stacked import Stacked as Stacked

@@ -3,12 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from ..core import Action, Carry, EnvSpec, Observation, Policy, PRNGKey
 from ..ops.distributions import Categorical, DiagGaussian, Distribution
+from ..ops.mixtures import GaussianMixture
 from .encoding import RunningNorm, action_mask
-from .heads import ActionHead
+from .heads import Head, HeadRecipe, Standard
 from .network import Network, Torso
 from .recurrent import is_recurrent, unroll
 
@@ -17,14 +18,14 @@ class ActorNetwork(eqx.Module):
     """A torso and a head that turns its features into the distribution of the action."""
 
     torso: Torso
-    head: ActionHead
+    head: Head
 
     @staticmethod
-    def of(network: Network, spec: EnvSpec, key: PRNGKey) -> "ActorNetwork":
-        """Fresh parameters."""
+    def of(network: Network, spec: EnvSpec, key: PRNGKey, head: HeadRecipe | None = None) -> "ActorNetwork":
+        """Fresh parameters, with the usual head of the space unless another is given."""
         torso_key, head_key = jax.random.split(key)
         torso = network.build(spec.observation, torso_key)
-        return ActorNetwork(torso, ActionHead.of(torso.features, spec.action, head_key))
+        return ActorNetwork(torso, (head or Standard()).build(torso.features, spec.action, head_key))
 
     def init(self) -> Carry:
         """The memory at the start of an episode."""
@@ -42,8 +43,12 @@ class ActorNetwork(eqx.Module):
 
     def along(self, carry: Carry, observation: Observation, done: Bool[Array, "T"]) -> Distribution:
         """The distributions of a sequence `[T]`, from the memory before its first step, reset after each end."""
-        _, features = unroll(self.torso, carry, observation, done)
+        features = self.features_along(carry, observation, done)
         return jax.vmap(lambda x, m: self.head(x, m))(features, action_mask(observation))
+
+    def features_along(self, carry: Carry, observation: Observation, done: Bool[Array, "T"]) -> Float[Array, "T F"]:
+        """What the head gets in each step of a sequence `[T]`."""
+        return unroll(self.torso, carry, observation, done)[1]
 
 
 class StochasticPolicy(Policy):
@@ -73,6 +78,12 @@ class StochasticPolicy(Policy):
             thoughts["probabilities"] = distribution.probs
         if isinstance(distribution, DiagGaussian):
             thoughts |= {"mean": distribution.mean, "std": jnp.exp(distribution.log_std)}
+        if isinstance(distribution, GaussianMixture):
+            thoughts |= {
+                "weights": distribution.weights,
+                "mean": distribution.mean,
+                "std": jnp.exp(distribution.log_std),
+            }
         return thoughts
 
     def _look(self, carry: Carry, observation: Observation) -> tuple[Carry, Distribution]:

@@ -1,11 +1,21 @@
-"""Heads: from features to a distribution over actions of any space, and to values."""
+"""Heads: from features to a distribution over actions of any space.
+
+A recipe (`HeadRecipe`) builds a `Head` for a space of actions, as a `Network` builds a `Torso`:
+
+    Standard          categorical, multi-categorical, Bernoulli, Gaussian: one peak in a box
+    Mixture           a mixture of Gaussians                                    (`mixture.py`)
+    Autoregressive    bins, each entry given those before it                    (`autoregressive.py`)
+    Latent            a Gaussian given a hidden variable, a conditional VAE     (`latent.py`)
+"""
+
+from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
-from ..core import PRNGKey, Spec
+from ..core import Action, Configured, PRNGKey, Spec
 from ..ops.distributions import Bernoulli, Categorical, DiagGaussian, Distribution, MultiCategorical
 from .network import Linear
 
@@ -13,7 +23,51 @@ ACTION_KINDS = ("discrete", "multi_discrete", "multi_binary", "box")
 """The kinds of actions that `ActionHead` has a distribution for."""
 
 
-class ActionHead(eqx.Module):
+class Head(eqx.Module):
+    """The last part of a policy's network, with its parameters."""
+
+    spec: eqx.AbstractVar[Spec]
+
+    @abstractmethod
+    def __call__(self, features: Float[Array, "F"], mask: Array | None = None) -> Distribution:
+        """The law of the action; `mask` says which choices are allowed, where there are choices."""
+
+    @abstractmethod
+    def loss(
+        self, features: Float[Array, "F"], action: Action, key: PRNGKey, mask: Array | None = None
+    ) -> Float[Array, ""]:
+        """What maximum likelihood minimises for one action: -log p(action), or an upper bound of it."""
+
+    @abstractmethod
+    def with_least_std(self, least: ScalarLike) -> "Head":
+        """The same head with standard deviations of `least` or more, in units of half the box."""
+
+
+class HeadRecipe(Configured):
+    """A recipe for a head."""
+
+    @property
+    @abstractmethod
+    def action_kinds(self) -> tuple[str, ...]:
+        """The kinds of actions it has a law for."""
+
+    @abstractmethod
+    def build(self, features: int, spec: Spec, key: PRNGKey) -> Head:
+        """A head with fresh parameters. Raises `ValueError` for actions it has no law for."""
+
+
+class Standard(HeadRecipe):
+    """The usual law of each kind of space (`ActionHead`)."""
+
+    @property
+    def action_kinds(self) -> tuple[str, ...]:
+        return ACTION_KINDS
+
+    def build(self, features: int, spec: Spec, key: PRNGKey) -> "ActionHead":
+        return ActionHead.of(features, spec, key)
+
+
+class ActionHead(Head):
     """A linear layer and a distribution: categorical, multi-categorical, Bernoulli, or Gaussian with a free log std.
 
     A Gaussian works in units of the action: where the box is bounded, output 0 is its centre and ±1 its bounds.
@@ -42,6 +96,32 @@ class ActionHead(eqx.Module):
             return Bernoulli(out.reshape(self.spec.shape))
         mean = jnp.asarray(centre(self.spec)) + half_width(self.spec) * out.reshape(self.spec.shape)
         return DiagGaussian(mean, self.log_std)
+
+    def loss(
+        self, features: Float[Array, "F"], action: Action, key: PRNGKey, mask: Array | None = None
+    ) -> Float[Array, ""]:
+        del key
+        return -self(features, mask).log_prob(action)
+
+    def with_least_std(self, least: ScalarLike) -> "ActionHead":
+        if self.spec.kind != "box":
+            return self
+        return eqx.tree_at(lambda h: h.log_std, self, at_least(self.log_std, least, self.spec))
+
+
+def at_least(log_std: Float[Array, "..."], least: ScalarLike, spec: Spec) -> Float[Array, "..."]:
+    """Logarithms of standard deviations, raised to that of `least` times half the box where they are below."""
+    return jnp.maximum(log_std, jnp.log(least * half_width(spec)))
+
+
+def require_kind(recipe: HeadRecipe, spec: Spec) -> None:
+    """Raise `ValueError` unless the recipe has a law for actions of this kind."""
+    if spec.kind not in recipe.action_kinds:
+        name = type(recipe).__name__.lower()
+        raise ValueError(
+            f"the head {name} is for {' or '.join(k.replace('_', '-') for k in recipe.action_kinds)} actions, and these are "
+            f"{spec.kind.replace('_', '-')}: use the head standard"
+        )
 
 
 def half_width(spec: Spec) -> np.ndarray:

@@ -32,6 +32,7 @@ from .importance import normalised_weights as normalised_weights
 from .importance import self_normalised_mean as self_normalised_mean
 from .linalg import conjugate_gradients as conjugate_gradients
 from .linalg import inner as inner
+from .mixtures import GaussianMixture as GaussianMixture
 from .rescale import compress as compress
 from .rescale import expand as expand
 from .retrace import TRACES as TRACES

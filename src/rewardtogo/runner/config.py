@@ -18,7 +18,7 @@ from ..catalogue import nearest
 from ..core import Schedule
 from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
-from ..nn import CNN, GRU, LSTM, MLP, Network
+from ..nn import CNN, GRU, LSTM, MLP, Autoregressive, Latent, Mixture, Network, Stacked, Standard
 from ..ops.schedules import parse_schedule, to_text
 from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
 from ..value.maximisers import CEM, Ascent, Sampled
@@ -27,10 +27,11 @@ from ..value.outputs import C51, Expectation, Quantiles
 
 Module = TypeVar("Module")
 
-_NETWORKS = (MLP, CNN, GRU, LSTM)
+_NETWORKS = (MLP, CNN, GRU, LSTM, Stacked)
+_HEADS = (Standard, Mixture, Autoregressive, Latent)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
-PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_MEMORIES, *_CHOICES)}
+PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES)}
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 
