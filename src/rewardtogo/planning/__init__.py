@@ -7,6 +7,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .linear_quadratic import LinearController as LinearController
+    from .linear_quadratic import LQProblem as LQProblem
+    from .linear_quadratic import Regulator as Regulator
+    from .linear_quadratic import lqr as lqr
+    from .linear_quadratic import lqr_infinite as lqr_infinite
+    from .linear_quadratic import riccati as riccati
     from .problem import FunctionProblem as FunctionProblem
     from .problem import ModelProblem as ModelProblem
     from .problem import Plan as Plan
@@ -19,6 +25,7 @@ if TYPE_CHECKING:
     from .problem import with_horizon as with_horizon
 
 _HOMES = {
+    "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why with_horizon",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
