@@ -7,12 +7,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .collocation import collocation as collocation
+    from .cross_entropy import cem as cem
+    from .cross_entropy import mppi as mppi
+    from .ilqr import ilqr as ilqr
     from .linear_quadratic import LinearController as LinearController
     from .linear_quadratic import LQProblem as LQProblem
     from .linear_quadratic import Regulator as Regulator
     from .linear_quadratic import lqr as lqr
     from .linear_quadratic import lqr_infinite as lqr_infinite
     from .linear_quadratic import riccati as riccati
+    from .mpc import ILQR as ILQR
+    from .mpc import MPC as MPC
+    from .mpc import PLANNERS as PLANNERS
+    from .mpc import Collocation as Collocation
+    from .mpc import CrossEntropy as CrossEntropy
+    from .mpc import GradientShooting as GradientShooting
+    from .mpc import NewtonShooting as NewtonShooting
+    from .mpc import PathIntegral as PathIntegral
+    from .mpc import Planner as Planner
+    from .mpc import RandomShooting as RandomShooting
     from .problem import FunctionProblem as FunctionProblem
     from .problem import ModelProblem as ModelProblem
     from .problem import Plan as Plan
@@ -23,8 +37,17 @@ if TYPE_CHECKING:
     from .problem import total_cost as total_cost
     from .problem import why as why
     from .problem import with_horizon as with_horizon
+    from .shooting import gradient_shooting as gradient_shooting
+    from .shooting import newton_shooting as newton_shooting
+    from .shooting import random_shooting as random_shooting
+    from .shooting import shooting_hessian as shooting_hessian
 
 _HOMES = {
+    "collocation": "collocation",
+    "cross_entropy": "cem mppi",
+    "ilqr": "ilqr",
+    "mpc": "MPC PLANNERS Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
+    "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why with_horizon",
 }

@@ -11,9 +11,12 @@ Sequential quadratic programming: with defects $f_t = f_t(\hat x_t, \hat u_t) - 
 $$\min_{\delta z} \sum_t c_t^\top \delta z_t + \tfrac12 \delta z_t^\top C_t \delta z_t
 \quad \text{subject to} \quad \delta x_{t+1} = F_t \delta z_t + f_t$$
 
-is a linear-quadratic regulator, solved in time proportional to H by the recursion of Algorithm 17; its costates $\lambda_t$ are the multipliers.
-Bounds on the actions are kept by a logarithmic barrier $-\tau \sum \log (u - u_{low}) + \log (u_{high} - u)$ whose weight $\tau$ goes to 0, and
-steps go at most 0.99 of the way to a bound. A step is taken as far as $J + \rho \sum_t |f_t|_1$ falls, with $\rho$ above the largest multiplier (Han 1977; Nocedal and Wright, section 18.3).
+is a linear-quadratic regulator, solved in time proportional to H by the recursion of Algorithm 17; its costates $\lambda_t$ are the
+multipliers.
+Bounds on the actions are kept by a logarithmic barrier $-\tau \sum \log (u - u_{low}) + \log (u_{high} - u)$ whose weight $\tau$ goes to
+0, and
+steps go at most 0.99 of the way to a bound. A step is taken as far as $J + \rho \sum_t |f_t|_1$ falls, with $\rho$ above the largest
+multiplier (Han 1977; Nocedal and Wright, section 18.3).
 
 Source: notes 8.2.6, which name the problem and no method.
 """
@@ -49,14 +52,17 @@ class Barrier(Problem):
     @staticmethod
     def of(problem: Problem, weight: Array) -> "Barrier":
         """The bounds become a price of this weight."""
-        return Barrier(problem, weight, problem.horizon, dataclasses.replace(problem.action, low=(-np.inf,), high=(np.inf,)))
+        return Barrier(
+            problem, weight, problem.horizon, dataclasses.replace(problem.action, low=(-np.inf,), high=(np.inf,))
+        )
 
     def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Float[Array, ""]]:
         following, cost = self.problem.step(state, action, t, key)
         low, high = self.problem.action.bounds()
         gaps = [action - low, high - action]
         price = sum(
-            -jnp.log(jnp.where(np.isfinite(bound), gap, 1.0)).sum() for gap, bound in zip(gaps, (low, high), strict=True)
+            -jnp.log(jnp.where(np.isfinite(bound), gap, 1.0)).sum()
+            for gap, bound in zip(gaps, (low, high), strict=True)
         )
         return following, cost + self.weight * price
 
@@ -121,9 +127,7 @@ def _programme(
             return (c + C @ dz + F.T @ after)[: s.states.shape[-1]], after
 
         end = e.c_final + e.C_final @ last
-        _, multipliers = jax.lax.scan(
-            costate, end, (e.F, e.c, e.C, jnp.concatenate([dx[:-1], du], 1)), reverse=True
-        )
+        _, multipliers = jax.lax.scan(costate, end, (e.F, e.c, e.C, jnp.concatenate([dx[:-1], du], 1)), reverse=True)
         penalty = jnp.maximum(0.3 * s.penalty, 1.2 * jnp.max(jnp.abs(multipliers)))
 
         def tried(alpha: Array) -> tuple[Array, Array, Array, Array]:
@@ -149,7 +153,9 @@ def _programme(
         done = settled & (s.barrier <= least)
         # Far from the end it is enough to come near.
         near = (length <= jnp.sqrt(s.barrier) * (1.0 + jnp.max(jnp.abs(s.states)))) & better
-        barrier = jnp.where(settled | near, jnp.where(s.barrier * LESS < least, 0.99 * least, s.barrier * LESS), s.barrier)
+        barrier = jnp.where(
+            settled | near, jnp.where(s.barrier * LESS < least, 0.99 * least, s.barrier * LESS), s.barrier
+        )
         mu = jnp.where(better & (first < 4), s.mu / 4.0, jnp.maximum(s.mu * 8.0, LEAST_MU))
         mu = jnp.where(mu < LEAST_MU, 0.0, mu)
         failed = jnp.where(sweep.bad_step >= 0, NOT_POSITIVE_DEFINITE, LINE_SEARCH_FAILED)
@@ -180,7 +186,8 @@ def _programme(
     gains = jnp.zeros((bounded.horizon, bounded.controls, states.shape[-1]), states.dtype)
     history = jnp.zeros(iterations, states.dtype)
     start = Iterate(
-        states, actions, gains, cost.astype(states.dtype), jnp.abs(defects).sum(), zero, zero, weight, jnp.zeros((), jnp.int32), jnp.asarray(running), history, history
+        states, actions, gains, cost.astype(states.dtype), jnp.abs(defects).sum(), zero, zero, weight, jnp.zeros((), jnp.int32),
+        jnp.asarray(running), history, history
     )  # fmt: skip
     going = lambda s: (s.reason == running) & (s.iteration < iterations) & jnp.isfinite(s.cost)  # noqa: E731
     return jax.lax.while_loop(going, iterate, start)

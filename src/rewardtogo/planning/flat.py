@@ -33,7 +33,9 @@ class FlatProblem(eqx.Module):
         state = jax.tree.map(jnp.asarray, state)
         leaves = [leaf for leaf in jax.tree.leaves(state) if _is_real(leaf)]
         if not leaves:
-            raise ValueError("the state holds no real numbers, so there is nothing to differentiate: use another planner")
+            raise ValueError(
+                "the state holds no real numbers, so there is nothing to differentiate: use another planner"
+            )
         check_dynamics(problem, state)
         flat = FlatProblem(problem, state)
         return flat, flat.split(state)
@@ -135,7 +137,9 @@ def _is_real(leaf: Any) -> bool:
 
 def check_dynamics(problem: Problem, state: State) -> None:
     """Raise `ValueError` unless a step leads to a state of the same shape and costs one number."""
-    following, cost = jax.eval_shape(lambda x, u: problem.step(x, u, 0, jax.random.key(0)), state, problem.action.zeros())
+    following, cost = jax.eval_shape(
+        lambda x, u: problem.step(x, u, 0, jax.random.key(0)), state, problem.action.zeros()
+    )
     shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree)  # noqa: E731
     if jax.tree.structure(following) != jax.tree.structure(state) or shapes(following) != shapes(state):
         raise ValueError(f"the dynamics lead from a state of shape {shapes(state)} to one of shape {shapes(following)}")
@@ -150,4 +154,3 @@ def require_finite(cost: Any, what: str) -> None:
             f"the cost of {what} is {float(np.max(np.asarray(cost))):g}: the dynamics or the cost give numbers that are not finite; "
             "start elsewhere, or shorten the horizon"
         )
-

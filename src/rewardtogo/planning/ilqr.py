@@ -17,7 +17,8 @@ As the notes print it (the full step, always) it diverges in practice (erratum E
 
 - $\alpha$ is the first of 1, 1/2, 1/4, ... whose cost falls by a share of what the model promises; all are tried side by side.
 - $\mu I$ is added to $Q_{uu}$, and grows while that is not positive definite or no $\alpha$ will do, and falls again after.
-- With bounds on the actions $k_t$ solves the box-constrained quadratic programme, and rows of $K_t$ whose action rests on its bound are 0 (Tassa,
+- With bounds on the actions $k_t$ solves the box-constrained quadratic programme, and rows of $K_t$ whose action rests on its bound are 0
+  (Tassa,
   Mansard and Todorov 2014).
 
 Sources: notes 8.2.8 with errata E8.7 and E8.8. Expansions are at the nominal point, where the notes write them at $(\delta x, \delta u)$.
@@ -70,7 +71,9 @@ def expand(problem: FlatProblem, states: Float[Array, "T X"], actions: Float[Arr
     z = jnp.concatenate([states[:-1], actions], 1)
     F, following, c, C = jax.vmap(at)(z, jnp.arange(problem.horizon))
     last = states[-1]
-    return Expansion(F, following - states[1:], c, C, jax.grad(problem.final_cost)(last), jax.hessian(problem.final_cost)(last))
+    return Expansion(
+        F, following - states[1:], c, C, jax.grad(problem.final_cost)(last), jax.hessian(problem.final_cost)(last)
+    )
 
 
 class Sweep(eqx.Module):
@@ -94,7 +97,8 @@ def backward(
 ) -> Sweep:
     """The backward pass with mu added to Q_uu. The model's cost at alpha is J + alpha slope + alpha^2/2 curvature.
 
-    `gradient`: dJ/du at the nominal trajectory, by its adjoint; `bad_step`: the last t at which Q_uu + mu I is not positive definite, or -1.
+    `gradient`: dJ/du at the nominal trajectory, by its adjoint; `bad_step`: the last t at which Q_uu + mu I is not positive definite, or
+    -1.
     """
     x, u = states.shape[-1], actions.shape[-1]
     low, high = problem.bounds()
@@ -131,7 +135,11 @@ def backward(
 
 
 def _bounded(
-    Q: Float[Array, "U U"], q: Float[Array, "U"], Q_ux: Float[Array, "U X"], low: Float[Array, "U"], high: Float[Array, "U"]
+    Q: Float[Array, "U U"],
+    q: Float[Array, "U"],
+    Q_ux: Float[Array, "U X"],
+    low: Float[Array, "U"],
+    high: Float[Array, "U"],
 ) -> tuple[Float[Array, "U"], Float[Array, "U X"], Float[Array, ""]]:
     """The k in the box that minimises k' Q k / 2 + q' k, by projected Newton steps, and the gains of the entries that rest on no bound."""
 
@@ -152,7 +160,11 @@ def _bounded(
         return tried[jnp.argmin(costs)]
 
     k = jnp.clip(jnp.zeros_like(q), low, high)
-    k = jax.lax.fori_loop(0, NEWTON_STEPS, newton, k) if len(q) > 1 else newton(jnp.zeros((), int), newton(jnp.zeros((), int), k))
+    k = (
+        jax.lax.fori_loop(0, NEWTON_STEPS, newton, k)
+        if len(q) > 1
+        else newton(jnp.zeros((), int), newton(jnp.zeros((), int), k))
+    )
     free = free_at(k)
     gains, _ = masked(free, Q_ux)
     _, pivot = definite_solve(Q, q[:, None])
@@ -207,16 +219,16 @@ def _search(
         # Rounding of the cost is all that is left: neither better nor worse.
         fall = jnp.where(better, s.cost - costs[first], 0.0)
         small = 1.0 + jnp.abs(s.cost)
-        flat = (sweep.bad_step < 0) & ((-sweep.slope <= tolerance * small) & (s.mu <= 1e-3) | (gradient <= 1e-3 * tolerance * small))
+        flat = (sweep.bad_step < 0) & (
+            (-sweep.slope <= tolerance * small) & (s.mu <= 1e-3) | (gradient <= 1e-3 * tolerance * small)
+        )
         growth = jnp.where(better, jnp.minimum(s.growth / 2.0, 0.5), jnp.maximum(s.growth * 2.0, 2.0))
         mu = jnp.where(better, s.mu * growth, jnp.maximum(s.mu * growth, LEAST_MU))
         mu = jnp.where(mu < LEAST_MU, 0.0, mu)
         reason = jnp.where(
             flat & (~better | (fall <= tolerance * small)),
             CONVERGED,
-            jnp.where(
-                mu > MOST_MU, jnp.where(sweep.bad_step >= 0, NOT_POSITIVE_DEFINITE, LINE_SEARCH_FAILED), running
-            ),
+            jnp.where(mu > MOST_MU, jnp.where(sweep.bad_step >= 0, NOT_POSITIVE_DEFINITE, LINE_SEARCH_FAILED), running),
         )
         keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
         cost = keep(costs[first], s.cost)

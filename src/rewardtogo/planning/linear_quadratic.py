@@ -15,7 +15,8 @@ and the constants of the values
 
 $$n_t = n_{t+1} + \tfrac12 f^\top V f + f^\top v + \tfrac12 k^\top Q_{uu} k + q_u^\top k + \tfrac12 \mathrm{tr}(V_{t+1} \Sigma_t),$$
 
-so that $\tfrac12 x^\top V_t x + v_t^\top x + n_t$ is what is still to be paid. Noise changes the constants and nothing else (certainty equivalence,
+so that $\tfrac12 x^\top V_t x + v_t^\top x + n_t$ is what is still to be paid. Noise changes the constants and nothing else (certainty
+equivalence,
 erratum E8.6), but the gains must then be used on the states that come: the plan alone is worse.
 
 Source: notes 8.2.7 with errata E8.1 to E8.6 (the printed $k = -Q_{uu} q_u$ lacks the inverse, among others). $C$ is made symmetric.
@@ -34,7 +35,7 @@ from jaxtyping import Array, Float, ScalarLike
 
 from ..core import Action, Carry, Observation, Policy, PRNGKey, Solution, Spec, State
 from ..ops.linalg import definite_solve
-from .problem import CONVERGED, NOT_FINITE, NOT_POSITIVE_DEFINITE, Plan, Problem, box, plan_of, whole
+from .problem import CONVERGED, NOT_FINITE, NOT_POSITIVE_DEFINITE, Problem, box, plan_of, whole
 
 
 def _array(name: str, value: Any, shape: tuple[int, ...], horizon: int) -> Array:
@@ -244,19 +245,27 @@ def _recursion(problem: LQProblem) -> tuple[Regulator, Float[Array, "H"]]:
 def riccati(problem: LQProblem) -> Solution:
     """The backward pass: a `Regulator`, whatever the first state (Algorithm 17, lines 2 to 12).
 
-    `stats`: `step` the last t at which Q_uu is not positive definite (-1 where there is none), and `least_pivot`. Raises `ValueError` there, unless
+    `stats`: `step` the last t at which Q_uu is not positive definite (-1 where there is none), and `least_pivot`. Raises `ValueError`
+    there, unless
     it is called inside a compiled function, where `converged` says it.
     """
     regulator, pivots = _recursion(problem)
     good = (pivots > 0) & jnp.isfinite(pivots)
     step = jnp.max(jnp.where(good, -1, jnp.arange(problem.horizon)))
     converged = jnp.all(good)
-    stats = {"step": step, "least_pivot": pivots.min(), "reason": jnp.where(converged, CONVERGED, NOT_POSITIVE_DEFINITE)}
+    stats = {
+        "step": step,
+        "least_pivot": pivots.min(),
+        "reason": jnp.where(converged, CONVERGED, NOT_POSITIVE_DEFINITE),
+    }
     if not isinstance(converged, jax.core.Tracer) and not np.all(converged):
         if not np.all(np.isfinite(pivots)):
-            raise ValueError(f"the value of step {int(np.max(step))} is not a finite number: look at F, C and the horizon")
+            raise ValueError(
+                f"the value of step {int(np.max(step))} is not a finite number: look at F, C and the horizon"
+            )
         raise ValueError(
-            f"Q_uu of step {int(np.max(step))} is not positive definite (least pivot {float(pivots.min()):.3g}), so the cost has no least value: "
+            f"Q_uu of step {int(np.max(step))} is not positive definite (least pivot {float(pivots.min()):.3g}), so the cost has no "
+            f"least value: "
             "make C_uu positive definite, or add a multiple of the identity to it"
         )
     return Solution(regulator, converged, stats)
@@ -265,7 +274,8 @@ def riccati(problem: LQProblem) -> Solution:
 def lqr(problem: LQProblem, state: Float[Array, "X"]) -> Solution:
     """The linear-quadratic regulator: the best plan from a state, with its gains (Algorithm 17, both passes).
 
-    `value` is a `Plan` along the mean of the dynamics; its cost includes what noise adds. `stats["regulator"]` holds the values. Errors as in `riccati`.
+    `value` is a `Plan` along the mean of the dynamics; its cost includes what noise adds. `stats["regulator"]` holds the values. Errors
+    as in `riccati`.
     """
     state = jnp.asarray(state)
     if state.shape != (problem.state_size,):
@@ -278,7 +288,9 @@ def lqr(problem: LQProblem, state: Float[Array, "X"]) -> Solution:
     if problem.noise is not None:
         added = 0.5 * sum_of_traces(problem, regulator.V)
         plan = eqx.tree_at(lambda p: p.cost, plan, plan.cost + added)
-    return Solution(plan, solution.converged, solution.stats | {"regulator": regulator, "iterations": jnp.ones((), int)})
+    return Solution(
+        plan, solution.converged, solution.stats | {"regulator": regulator, "iterations": jnp.ones((), int)}
+    )
 
 
 def _follow(problem: LQProblem, regulator: Regulator, state: Float[Array, "X"]) -> Float[Array, "H U"]:
@@ -317,17 +329,25 @@ def lqr_infinite(F: Any, C: Any, tolerance: float = 1e-12, iterations: int = 64)
         raise ValueError("an endless horizon needs dynamics and cost that do not change with time")
     A, B, Q = np.split(np.asarray(one.F), [x], 1)[0], np.asarray(one.F)[:, x:], np.asarray(one.C)
     if np.min(np.linalg.eigvalsh(Q[x:, x:])) <= 0:
-        raise ValueError("C_uu is not positive definite, so actions are not all paid for: add a multiple of the identity to it")
+        raise ValueError(
+            "C_uu is not positive definite, so actions are not all paid for: add a multiple of the identity to it"
+        )
     _require_stabilisable(A, B)
     V, converged, count = _doubling(jnp.asarray(A), jnp.asarray(B), jnp.asarray(Q), tolerance, iterations)
     now = backup(one.F, one.f, one.C, one.c, V, jnp.zeros(x, V.dtype))
     radius = np.max(np.abs(np.linalg.eigvals(A + B @ np.asarray(now.K))))
     if not (np.all(np.isfinite(V)) and radius < 1):
         raise ValueError(
-            f"the recursion does not settle at a stabilising gain (spectral radius of A + B K {radius:.3g}): does the cost see every unstable state?"
+            f"the recursion does not settle at a stabilising gain (spectral radius of A + B K {radius:.3g}): does the cost see "
+            f"every unstable state?"
         )
     regulator = Regulator(
-        *(leaf[None] for leaf in (now.K, now.k)), jnp.stack([V, V]), jnp.zeros((2, x)), jnp.zeros(2), now.Q[None], now.q[None]
+        *(leaf[None] for leaf in (now.K, now.k)),
+        jnp.stack([V, V]),
+        jnp.zeros((2, x)),
+        jnp.zeros(2),
+        now.Q[None],
+        now.q[None],
     )
     reason = jnp.where(converged, CONVERGED, NOT_FINITE)
     return Solution(regulator, converged, {"iterations": count, "reason": reason, "spectral_radius": radius})
@@ -342,9 +362,7 @@ def _require_stabilisable(A: np.ndarray, B: np.ndarray) -> None:
 
 
 @partial(jax.jit, static_argnums=4)
-def _doubling(
-    A: Array, B: Array, C: Array, tolerance: ScalarLike, iterations: int
-) -> tuple[Array, Array, Array]:
+def _doubling(A: Array, B: Array, C: Array, tolerance: ScalarLike, iterations: int) -> tuple[Array, Array, Array]:
     """V, whether it settled, and after how many doublings."""
     x = len(A)
     Q, N, R = C[:x, :x], C[:x, x:], C[x:, x:]

@@ -94,7 +94,7 @@ def with_horizon(problem: AnyProblem, horizon: int) -> AnyProblem:
 
 
 class FunctionProblem(Problem):
-    """A problem from functions:
+    """A problem from functions, in five lines.
 
         problem = rtg.FunctionProblem(f, c, horizon=50, action=2)
         solution = rtg.ilqr(problem, x0)
@@ -159,7 +159,9 @@ def box(size: int, low: Any = -np.inf, high: Any = np.inf) -> Spec:
     try:
         bounds = [np.broadcast_to(np.asarray(bound, np.float64), (size,)) for bound in (low, high)]
     except ValueError:
-        raise ValueError(f"the bounds of {size} numbers are a number or {size} of them each, not {low} and {high}") from None
+        raise ValueError(
+            f"the bounds of {size} numbers are a number or {size} of them each, not {low} and {high}"
+        ) from None
     if np.any(np.isnan(bounds)) or np.any(bounds[0] >= bounds[1]):
         raise ValueError(f"a lower bound must lie below the upper one, and {low} and {high} do not")
     return Spec("box", (int(size),), low=tuple(bounds[0].tolist()), high=tuple(bounds[1].tolist()))
