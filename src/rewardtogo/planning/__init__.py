@@ -7,10 +7,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .collocation import collocation as collocation
     from .cross_entropy import cem as cem
     from .cross_entropy import mppi as mppi
-    from .ilqr import ilqr as ilqr
+    from .identification import identify as identify
+    from .iterated_lqr import ilqr as ilqr
     from .linear_quadratic import LinearController as LinearController
     from .linear_quadratic import LQProblem as LQProblem
     from .linear_quadratic import Regulator as Regulator
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from .mpc import PathIntegral as PathIntegral
     from .mpc import Planner as Planner
     from .mpc import RandomShooting as RandomShooting
+    from .open_loop import best_open_loop as best_open_loop
+    from .open_loop import open_loop_return as open_loop_return
+    from .open_loop import open_loop_returns as open_loop_returns
     from .problem import FunctionProblem as FunctionProblem
     from .problem import ModelProblem as ModelProblem
     from .problem import Plan as Plan
@@ -36,20 +39,22 @@ if TYPE_CHECKING:
     from .problem import rollout as rollout
     from .problem import total_cost as total_cost
     from .problem import why as why
-    from .problem import with_horizon as with_horizon
     from .shooting import gradient_shooting as gradient_shooting
     from .shooting import newton_shooting as newton_shooting
     from .shooting import random_shooting as random_shooting
     from .shooting import shooting_hessian as shooting_hessian
+    from .sqp import collocation as collocation
 
 _HOMES = {
-    "collocation": "collocation",
+    "identification": "identify",
+    "open_loop": "best_open_loop open_loop_return open_loop_returns",
+    "sqp": "collocation",
     "cross_entropy": "cem mppi",
-    "ilqr": "ilqr",
+    "iterated_lqr": "ilqr",
     "mpc": "MPC PLANNERS Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
     "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
-    "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why with_horizon",
+    "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 

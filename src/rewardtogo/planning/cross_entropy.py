@@ -25,6 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..core import Action, PRNGKey, Solution, State
@@ -109,7 +110,9 @@ def first_law(problem: Problem, guess: Any = None, sd: Any = None) -> Law:
     if spec.kind == "box":
         low, high = spec.bounds()
         bounded = np.isfinite(low) & np.isfinite(high)
-        middle, half = (np.where(bounded, (high + sign * low) / 2, default) for sign, default in ((1, 0.0), (-1, 1.0)))
+        # Without bounds the standard normal, which is what -1 and 1 give here.
+        low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        middle, half = (low + high) / 2, (high - low) / 2
         shape = (horizon, *spec.shape)
         mean = jnp.broadcast_to(middle, shape) if guess is None else jnp.asarray(guess)
         if mean.shape != shape:
@@ -193,7 +196,7 @@ def _search(
 
 def cem(
     problem: Problem,
-    state: State,
+    state: Any,
     key: PRNGKey,
     *,
     samples: int = 500,
@@ -230,7 +233,7 @@ def cem(
 
 def mppi(
     problem: Problem,
-    state: State,
+    state: Any,
     key: PRNGKey,
     *,
     samples: int = 500,
@@ -249,7 +252,7 @@ def mppi(
     """
     if samples < 2:
         raise ValueError(f"MPPI needs at least two samples, not {samples}")
-    if not isinstance(temperature, jax.core.Tracer) and not temperature > 0:
+    if not isinstance(temperature, Tracer) and not np.all(np.asarray(temperature) > 0):
         raise ValueError(f"the temperature must be more than 0, not {temperature}")
     return _cross_entropy(
         problem, state, key, samples, None, iterations, guess, sd, temperature, smoothing, floor, 0.0, particles, result

@@ -7,10 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..core import State
-from .problem import Plan, Problem
+from .problem import Plan, Problem, typed
 
 
 class FlatProblem(eqx.Module):
@@ -31,12 +32,12 @@ class FlatProblem(eqx.Module):
                 "use a planner for them, such as cem_discrete, random_shooting or mcts"
             )
         state = jax.tree.map(jnp.asarray, state)
-        leaves = [leaf for leaf in jax.tree.leaves(state) if _is_real(leaf)]
-        if not leaves:
+        if not any(_is_real(leaf) for leaf in jax.tree.leaves(state)):
             raise ValueError(
                 "the state holds no real numbers, so there is nothing to differentiate: use another planner"
             )
         check_dynamics(problem, state)
+        state = typed(problem, state, problem.action.zeros())
         flat = FlatProblem(problem, state)
         return flat, flat.split(state)
 
@@ -118,17 +119,27 @@ class FlatProblem(eqx.Module):
         low, high = self.bounds()
         return jnp.clip(jnp.asarray(actions, dtype).reshape(self.horizon, self.controls), low[None], high[None])
 
-    def plan(self, states: Array, actions: Array, gains: Array | None = None) -> Plan:
-        """The `Plan` of these vectors, its cost counted again; with gains as they answer deviations.
 
-        Without noise there are none but those of rounding, and on an unstable system these grow until the actions alone lead elsewhere.
-        """
-        if gains is None:
-            cost = self.total(states[0], actions)
-        else:
-            answer = lambda x, now: now[1] + now[2] @ (x - now[0])  # noqa: E731
-            cost = self.follow(states[0], answer, (states[:-1], actions, gains))[2]
-        return Plan(self.shape_action(actions), jax.vmap(self.join)(states), cost, gains)
+@jax.jit
+def finished(
+    flat: FlatProblem, states: Float[Array, "T X"], actions: Float[Array, "H U"], gains: Array | None = None
+) -> Plan:
+    """The `Plan` of vectors, its cost counted again; with gains as they answer deviations.
+
+    Without noise there are none but those of rounding, and on an unstable system these grow until the actions alone lead elsewhere.
+    """
+    if gains is None:
+        cost = flat.total(states[0], actions)
+    else:
+        answer = lambda x, now: now[1] + now[2] @ (x - now[0])  # noqa: E731
+        cost = flat.follow(states[0], answer, (states[:-1], actions, gains))[2]
+    return Plan(flat.shape_action(actions), jax.vmap(flat.join)(states), cost, gains)
+
+
+@jax.jit
+def followed(flat: FlatProblem, x0: Float[Array, "X"], actions: Float[Array, "H U"]) -> Plan:
+    """The `Plan` of actions alone."""
+    return finished(flat, flat.follow(x0, lambda _, u: u, actions)[0], actions)
 
 
 def _is_real(leaf: Any) -> bool:
@@ -149,7 +160,7 @@ def check_dynamics(problem: Problem, state: State) -> None:
 
 def require_finite(cost: Any, what: str) -> None:
     """Raise `ValueError` where a cost is known and no number."""
-    if not isinstance(cost, jax.core.Tracer) and not np.all(np.isfinite(cost)):
+    if not isinstance(cost, Tracer) and not np.all(np.isfinite(cost)):
         raise ValueError(
             f"the cost of {what} is {float(np.max(np.asarray(cost))):g}: the dynamics or the cost give numbers that are not finite; "
             "start elsewhere, or shorten the horizon"

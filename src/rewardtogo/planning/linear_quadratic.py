@@ -22,8 +22,6 @@ erratum E8.6), but the gains must then be used on the states that come: the plan
 Source: notes 8.2.7 with errata E8.1 to E8.6 (the printed $k = -Q_{uu} q_u$ lacks the inverse, among others). $C$ is made symmetric.
 """
 
-import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -31,6 +29,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, ScalarLike
 
 from ..core import Action, Carry, Observation, Policy, PRNGKey, Solution, Spec, State
@@ -68,8 +67,8 @@ class LQProblem(Problem):
     C_final: Float[Array, "X X"]
     c_final: Float[Array, "X"]
     noise: Float[Array, "*H X X"] | None
-    horizon: int = eqx.field(static=True)
-    action: Spec = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    controls: Spec = eqx.field(static=True)
 
     def __init__(
         self,
@@ -83,8 +82,8 @@ class LQProblem(Problem):
         noise: Any = None,
         action: Spec | None = None,
     ):
-        self.horizon = whole(horizon)
-        shape = jnp.shape(F)
+        self.steps = whole(horizon)
+        shape = np.shape(F)
         if len(shape) not in (2, 3) or shape[-1] <= shape[-2]:
             raise ValueError(
                 f"F maps a state and an action to a state, so it is [X, X + U], not {shape}: are there no actions?"
@@ -100,7 +99,25 @@ class LQProblem(Problem):
         self.C_final = 0.5 * (final + final.T)
         self.c_final = _array("c_final", zeros(c_final, x), (x,), -1)
         self.noise = None if noise is None else _array("noise", noise, (x, x), horizon)
-        self.action = box(z - x) if action is None else action
+        self.controls = box(z - x) if action is None else action
+
+    @property
+    def horizon(self) -> int:
+        return self.steps
+
+    @property
+    def action(self) -> Spec:
+        return self.controls
+
+    def with_horizon(self, horizon: int) -> "LQProblem":
+        return self._with(horizon, self.noise)
+
+    def without_noise(self) -> "LQProblem":
+        """The mean of the dynamics."""
+        return self._with(self.steps, None)
+
+    def _with(self, horizon: int, noise: Array | None) -> "LQProblem":
+        return LQProblem(self.F, self.C, horizon, self.f, self.c, self.C_final, self.c_final, noise, self.controls)
 
     @property
     def state_size(self) -> int:
@@ -153,8 +170,9 @@ class Regulator(eqx.Module):
     Q: Float[Array, "H Z Z"]
     q: Float[Array, "H Z"]
 
-    def cost_to_go(self, state: Float[Array, "X"], t: int = 0) -> Float[Array, ""]:
+    def cost_to_go(self, state: Any, t: int = 0) -> Float[Array, ""]:
         """What is still to be paid from a state on, in the mean over noise."""
+        state = jnp.asarray(state)
         return 0.5 * state @ self.V[t] @ state + self.v[t] @ state + self.constant[t]
 
     def controller(self) -> "LinearController":
@@ -217,8 +235,9 @@ def backup(
     Q_xx, Q_ux, Q_uu = Q[:x, :x], Q[x:, :x], Q[x:, x:]
     solved, pivot = definite_solve(Q_uu, jnp.concatenate([Q_ux, q[x:, None]], 1))
     K, k = -solved[:, :x], -solved[:, x]
-    half = Q_ux.T + 0.5 * K.T @ Q_uu
-    V_new = Q_xx + half @ K + (half @ K).T
+    # Symmetric to the last bit, or rounding grows from step to step.
+    half = 0.5 * Q_xx + (Q_ux.T + 0.5 * K.T @ Q_uu) @ K
+    V_new = half + half.T
     v_new = q[:x] + Q_ux.T @ k + K.T @ (q[x:] + Q_uu @ k)
     added = 0.5 * f @ V @ f + f @ v + (0.5 * Q_uu @ k + q[x:]) @ k
     return Backup(K, k, V_new, v_new, added, Q, q, pivot)
@@ -258,7 +277,7 @@ def riccati(problem: LQProblem) -> Solution:
         "least_pivot": pivots.min(),
         "reason": jnp.where(converged, CONVERGED, NOT_POSITIVE_DEFINITE),
     }
-    if not isinstance(converged, jax.core.Tracer) and not np.all(converged):
+    if not isinstance(converged, Tracer) and not np.all(converged):
         if not np.all(np.isfinite(pivots)):
             raise ValueError(
                 f"the value of step {int(np.max(step))} is not a finite number: look at F, C and the horizon"
@@ -271,7 +290,7 @@ def riccati(problem: LQProblem) -> Solution:
     return Solution(regulator, converged, stats)
 
 
-def lqr(problem: LQProblem, state: Float[Array, "X"]) -> Solution:
+def lqr(problem: LQProblem, state: Any) -> Solution:
     """The linear-quadratic regulator: the best plan from a state, with its gains (Algorithm 17, both passes).
 
     `value` is a `Plan` along the mean of the dynamics; its cost includes what noise adds. `stats["regulator"]` holds the values. Errors
@@ -282,17 +301,17 @@ def lqr(problem: LQProblem, state: Float[Array, "X"]) -> Solution:
         raise ValueError(f"the state has shape {state.shape} and F wants ({problem.state_size},)")
     solution = riccati(problem)
     regulator: Regulator = solution.value
-    quiet = dataclasses.replace(problem, noise=None)
+    quiet = problem.without_noise()
     actions = _follow(quiet, regulator, state)
     plan = plan_of(quiet, state, actions, gains=regulator.K)
     if problem.noise is not None:
-        added = 0.5 * sum_of_traces(problem, regulator.V)
-        plan = eqx.tree_at(lambda p: p.cost, plan, plan.cost + added)
+        plan = eqx.tree_at(lambda p: p.cost, plan, plan.cost + _paid_to_noise(problem, regulator.V))
     return Solution(
         plan, solution.converged, solution.stats | {"regulator": regulator, "iterations": jnp.ones((), int)}
     )
 
 
+@jax.jit
 def _follow(problem: LQProblem, regulator: Regulator, state: Float[Array, "X"]) -> Float[Array, "H U"]:
     """The forward pass: the gains on the states they lead to."""
 
@@ -306,14 +325,10 @@ def _follow(problem: LQProblem, regulator: Regulator, state: Float[Array, "X"]) 
     return jax.lax.scan(step, start, (regulator.K, regulator.k, jnp.arange(problem.horizon)))[1]
 
 
-def sum_of_traces(problem: LQProblem, V: Float[Array, "T X X"]) -> Float[Array, ""]:
-    """Sum over t of tr(V_{t+1} Sigma_t): twice what noise adds to the cost (item 8.35)."""
-    return sum_over_steps(lambda t: (V[t + 1] * problem.noise_at(t)).sum(), problem.horizon)
-
-
-def sum_over_steps(term: Callable[[Array], Array], horizon: int) -> Float[Array, ""]:
-    """A sum over t = 0 .. horizon - 1."""
-    return jax.vmap(term)(jnp.arange(horizon)).sum()
+@jax.jit
+def _paid_to_noise(problem: LQProblem, V: Float[Array, "T X X"]) -> Float[Array, ""]:
+    """Sum over t of tr(V_{t+1} Sigma_t) / 2: what noise adds to the cost (item 8.35)."""
+    return 0.5 * jax.vmap(lambda t: (V[t + 1] * problem.noise_at(t)).sum())(jnp.arange(problem.horizon)).sum()
 
 
 def lqr_infinite(F: Any, C: Any, tolerance: float = 1e-12, iterations: int = 64) -> Solution:
@@ -341,14 +356,8 @@ def lqr_infinite(F: Any, C: Any, tolerance: float = 1e-12, iterations: int = 64)
             f"the recursion does not settle at a stabilising gain (spectral radius of A + B K {radius:.3g}): does the cost see "
             f"every unstable state?"
         )
-    regulator = Regulator(
-        *(leaf[None] for leaf in (now.K, now.k)),
-        jnp.stack([V, V]),
-        jnp.zeros((2, x)),
-        jnp.zeros(2),
-        now.Q[None],
-        now.q[None],
-    )
+    v, constant = jnp.zeros((2, x), V.dtype), jnp.zeros(2, V.dtype)
+    regulator = Regulator(now.K[None], now.k[None], jnp.stack([V, V]), v, constant, now.Q[None], now.q[None])
     reason = jnp.where(converged, CONVERGED, NOT_FINITE)
     return Solution(regulator, converged, {"iterations": count, "reason": reason, "spectral_radius": radius})
 

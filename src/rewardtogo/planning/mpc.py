@@ -18,12 +18,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..core import Action, Carry, Configured, Number, Observation, Policy, PRNGKey, Solution, State, number, setting
-from .collocation import collocation
 from .cross_entropy import cem, mppi
 from .flat import FlatProblem
-from .ilqr import ilqr
+from .iterated_lqr import ilqr
 from .problem import ModelProblem, Problem
 from .shooting import gradient_shooting, newton_shooting, random_shooting
+from .sqp import collocation
 
 
 class Planner(Configured):

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, ScalarLike
 
 from ..core import Action, PRNGKey, Solution, Spec, State
 from ..ops.linalg import definite_solve
-from .flat import FlatProblem, check_dynamics, require_finite
+from .flat import FlatProblem, check_dynamics, followed, require_finite
 from .problem import CONVERGED, LINE_SEARCH_FAILED, MAX_ITERS, Problem, plan_of, total_cost
 
 
@@ -41,9 +41,7 @@ def mean_costs(
     return jax.vmap(one)(candidates)
 
 
-def random_actions(
-    action: Spec, horizon: int, number: int, key: PRNGKey, law: Literal["uniform", "gaussian"], sd: ScalarLike
-) -> Action:
+def random_actions(action: Spec, horizon: int, number: int, key: PRNGKey, law: str, sd: ScalarLike) -> Action:
     """`number` random sequences; the first ones are the same for every larger number.
 
     `law`: uniform over the space, or Gaussian around 0 with deviation `sd`, clipped to the bounds.
@@ -68,7 +66,7 @@ def _shoot(
 
 def random_shooting(
     problem: Problem,
-    state: State,
+    state: Any,
     key: PRNGKey,
     *,
     samples: int = 1000,
@@ -123,7 +121,7 @@ def _descend(
     inside = lambda u: jnp.clip(u, low[None], high[None])  # noqa: E731
 
     def held(u: Array, g: Array) -> Array:
-        return ((u <= low) & (g > 0)) | ((u >= high) & (g < 0))
+        return ((u <= low[None]) & (g > 0)) | ((u >= high[None]) & (g < 0))
 
     def going(loop: tuple) -> Array:
         _, _, _, _, size, count, _ = loop
@@ -152,7 +150,7 @@ DEFAULT_OPTIMISER = optax.adam(0.05)
 
 def gradient_shooting(
     problem: Problem,
-    state: State,
+    state: Any,
     actions: Any = None,
     *,
     optimiser: optax.GradientTransformation = DEFAULT_OPTIMISER,
@@ -172,12 +170,7 @@ def gradient_shooting(
     require_finite(costs[0], "the first guess")
     reason = jnp.where(size <= tolerance, CONVERGED, MAX_ITERS)
     stats = {"iterations": count, "reason": reason, "gradient": size, "costs": costs}
-    return Solution(_followed(flat, x0, best), size <= tolerance, stats)
-
-
-@jax.jit
-def _followed(flat: FlatProblem, x0: Array, actions: Array) -> Any:
-    return flat.plan(flat.follow(x0, lambda _, u: u, actions)[0], actions)
+    return Solution(followed(flat, x0, best), size <= tolerance, stats)
 
 
 def shooting_hessian(
@@ -269,7 +262,7 @@ def _newton(
 
 def newton_shooting(
     problem: Problem,
-    state: State,
+    state: Any,
     actions: Any = None,
     *,
     iterations: int = 100,
@@ -290,4 +283,4 @@ def newton_shooting(
     require_finite(found.cost, "the first guess")
     reason = jnp.where(found.reason < 0, MAX_ITERS, found.reason)
     stats = {"iterations": found.iteration, "reason": reason, "gradient": found.gradient, "costs": found.costs}
-    return Solution(_followed(flat, x0, found.actions), reason == CONVERGED, stats)
+    return Solution(followed(flat, x0, found.actions), reason == CONVERGED, stats)

@@ -32,9 +32,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..core import Solution, State
+from ..core import Solution
 from ..ops.linalg import definite_solve
-from .flat import FlatProblem, require_finite
+from .flat import FlatProblem, finished, require_finite
 from .problem import CONVERGED, LINE_SEARCH_FAILED, MAX_ITERS, NOT_POSITIVE_DEFINITE, Problem
 
 ALPHAS = tuple(0.5**i for i in range(11))
@@ -101,7 +101,7 @@ def backward(
     -1.
     """
     x, u = states.shape[-1], actions.shape[-1]
-    low, high = problem.bounds()
+    low, high = map(jnp.asarray, problem.bounds())
 
     def step(loop: tuple[Array, ...], now: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         V, v, costate = loop
@@ -119,8 +119,8 @@ def backward(
         else:
             solved, pivot = definite_solve(held, jnp.concatenate([q[x:, None], Q_ux], 1))
             k, K = -solved[:, 0], -solved[:, 1:]
-        half = Q_ux.T + 0.5 * K.T @ Q_uu
-        V = Q[:x, :x] + half @ K + (half @ K).T
+        half = 0.5 * Q[:x, :x] + (Q_ux.T + 0.5 * K.T @ Q_uu) @ K
+        V = half + half.T
         v = q[:x] + Q_ux.T @ k + K.T @ (q[x:] + Q_uu @ k)
         adjoint = c + F.T @ costate
         return (V, v, adjoint[:x]), (K, k, q[x:] @ k, k @ Q_uu @ k, adjoint[x:], pivot)
@@ -155,7 +155,9 @@ def _bounded(
         free = free_at(k)
         step, _ = masked(free, -(Q @ k + q)[:, None])
         # A step that overshoots a bound may miss the least cost; halving finds the way along the face.
-        tried = jnp.clip(k[None] + jnp.asarray([1.0, 0.5, 0.25, 0.1], k.dtype)[:, None] * step[None, :, 0], low, high)
+        tried = jnp.clip(
+            k[None] + jnp.asarray([1.0, 0.5, 0.25, 0.1], k.dtype)[:, None] * step[None, :, 0], low[None], high[None]
+        )
         costs = jax.vmap(lambda k: 0.5 * k @ Q @ k + q @ k)(tried)
         return tried[jnp.argmin(costs)]
 
@@ -197,7 +199,7 @@ def _search(
     tolerance: Float[Array, ""],
     ddp: bool,
 ) -> Search:
-    low, high = problem.bounds()
+    low, high = map(jnp.asarray, problem.bounds())
     running = -1
 
     def iterate(s: Search) -> Search:
@@ -214,7 +216,7 @@ def _search(
         first = jnp.argmax(good)
         better = good[first]
         # A bounded action may rest where the gradient points outwards: what counts is the part that can be followed.
-        stuck = ((s.actions <= low) & (sweep.gradient > 0)) | ((s.actions >= high) & (sweep.gradient < 0))
+        stuck = ((s.actions <= low[None]) & (sweep.gradient > 0)) | ((s.actions >= high[None]) & (sweep.gradient < 0))
         gradient = jnp.max(jnp.abs(jnp.where(stuck, 0.0, sweep.gradient)))
         # Rounding of the cost is all that is left: neither better nor worse.
         fall = jnp.where(better, s.cost - costs[first], 0.0)
@@ -268,7 +270,7 @@ def _search(
 
 def ilqr(
     problem: Problem,
-    state: State,
+    state: Any,
     actions: Any = None,
     *,
     iterations: int = 200,
@@ -307,4 +309,4 @@ def ilqr(
         "mu": found.mu,
         "step": found.bad_step,
     }
-    return Solution(flat.plan(found.states, found.actions, found.gains), reason == CONVERGED, stats)
+    return Solution(finished(flat, found.states, found.actions, found.gains), reason == CONVERGED, stats)

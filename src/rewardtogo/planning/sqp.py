@@ -32,8 +32,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..core import Action, PRNGKey, Solution, Spec, State
-from .flat import FlatProblem, require_finite
-from .ilqr import ALPHAS, ENOUGH, LEAST_MU, MOST_MU, backward, expand
+from .flat import FlatProblem, finished, require_finite
+from .iterated_lqr import ALPHAS, ENOUGH, LEAST_MU, MOST_MU, backward, expand
 from .problem import CONVERGED, LINE_SEARCH_FAILED, MAX_ITERS, NOT_POSITIVE_DEFINITE, Problem
 
 TO_THE_BOUND = 0.99
@@ -46,15 +46,17 @@ class Barrier(Problem):
 
     problem: Problem
     weight: Float[Array, ""]
-    horizon: int = eqx.field(static=True)
-    action: Spec = eqx.field(static=True)
 
-    @staticmethod
-    def of(problem: Problem, weight: Array) -> "Barrier":
-        """The bounds become a price of this weight."""
-        return Barrier(
-            problem, weight, problem.horizon, dataclasses.replace(problem.action, low=(-np.inf,), high=(np.inf,))
-        )
+    @property
+    def horizon(self) -> int:
+        return self.problem.horizon
+
+    @property
+    def action(self) -> Spec:
+        return dataclasses.replace(self.problem.action, low=(-np.inf,), high=(np.inf,))
+
+    def with_horizon(self, horizon: int) -> "Barrier":
+        return Barrier(self.problem.with_horizon(horizon), self.weight)
 
     def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Float[Array, ""]]:
         following, cost = self.problem.step(state, action, t, key)
@@ -105,7 +107,7 @@ def _programme(
     low, high = bounded.bounds()
     running = -1
     zero = jnp.zeros((), states.dtype)
-    under = lambda weight: FlatProblem(Barrier.of(bounded.problem, weight), bounded.first)  # noqa: E731
+    under = lambda weight: FlatProblem(Barrier(bounded.problem, weight), bounded.first)  # noqa: E731
 
     def iterate(s: Iterate) -> Iterate:
         problem = under(s.barrier)
@@ -195,7 +197,7 @@ def _programme(
 
 def collocation(
     problem: Problem,
-    state: State,
+    state: Any,
     actions: Any = None,
     states: Any = None,
     *,
@@ -225,7 +227,7 @@ def collocation(
     if tolerance is None:
         tolerance = 1e-9 if x0.dtype == jnp.float64 else 1e-4
     found = _programme(flat, states, guess, iterations, jnp.asarray(tolerance, x0.dtype))
-    require_finite(found.cost, "the first guess")
+    require_finite(found.cost + found.defect, "the first guess")
     reason = jnp.where(found.reason < 0, MAX_ITERS, found.reason)
     _, defects = _weigh(flat, found.states, found.actions)
     done = jnp.arange(iterations) < found.iteration
@@ -236,7 +238,7 @@ def collocation(
         "costs": jnp.where(done, found.costs, found.cost),
         "defects": jnp.where(done, found.defects, found.defect),
     }
-    return Solution(flat.plan(found.states, found.actions, found.gains), reason == CONVERGED, stats)
+    return Solution(finished(flat, found.states, found.actions, found.gains), reason == CONVERGED, stats)
 
 
 def _inside(flat: FlatProblem, actions: Float[Array, "H U"]) -> Float[Array, "H U"]:
