@@ -29,7 +29,7 @@ class FlatProblem(eqx.Module):
         if problem.action.kind != "box":
             raise ValueError(
                 f"this planner differentiates with respect to the actions, and these are {problem.action.kind.replace('_', '-')}: "
-                "use a planner for them, such as cem_discrete, random_shooting or mcts"
+                "use a planner for them, such as cem or random_shooting"
             )
         state = jax.tree.map(jnp.asarray, state)
         if not any(_is_real(leaf) for leaf in jax.tree.leaves(state)):
