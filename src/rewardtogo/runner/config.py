@@ -20,6 +20,15 @@ from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Network
 from ..ops.schedules import parse_schedule, to_text
+from ..planning.mpc import (
+    ILQR,
+    Collocation,
+    CrossEntropy,
+    GradientShooting,
+    NewtonShooting,
+    PathIntegral,
+    RandomShooting,
+)
 from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
 from ..value.maximisers import CEM, Ascent, Sampled
 from ..value.noise import OU, Gaussian
@@ -30,7 +39,8 @@ Module = TypeVar("Module")
 _NETWORKS = (MLP, CNN, GRU, LSTM)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
-PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_MEMORIES, *_CHOICES)}
+_PLANNERS = (RandomShooting, CrossEntropy, PathIntegral, GradientShooting, NewtonShooting, ILQR, Collocation)
+PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_MEMORIES, *_CHOICES, *_PLANNERS)}
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 
