@@ -57,6 +57,13 @@ def item(request: pytest.FixtureRequest) -> Callable[[str], contextlib.AbstractC
     return record
 
 
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Double precision for one test."""
+    with jax.enable_x64(True):
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
     """Compiled programs of one file are of no use to the next, and together they fill the memory."""

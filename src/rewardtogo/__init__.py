@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from .loops.off_policy import OffPolicy as OffPolicy
     from .loops.offline import Offline as Offline
     from .loops.on_policy import OnPolicy as OnPolicy
+    from .model_based.mbrl import ModelBased as ModelBased
     from .nn.network import CNN as CNN
     from .nn.network import MLP as MLP
     from .nn.recurrent import GRU as GRU
@@ -90,6 +91,7 @@ _HOMES = {
     "loops.off_policy": "OffPolicy",
     "loops.offline": "Offline",
     "loops.on_policy": "OnPolicy",
+    "model_based.mbrl": "ModelBased",
     "nn.network": "CNN MLP",
     "nn.recurrent": "GRU LSTM",
     "policy_gradient.npg": "NPG",
@@ -121,6 +123,7 @@ _ROOMS = (
     "figures",
     "imitation",
     "loops",
+    "model_based",
     "nn",
     "ops",
     "planning",

@@ -11,6 +11,7 @@ class Row:
     """One algorithm: where its learner lives, which loop runs it, where the notes have it, and what it can act in.
 
     Several algorithms may be settings of one learner: `learner`, `loop_options` and `num_envs` are what a row sets, unless the user does.
+    `eval_episodes`: of an evaluation, where the usual number would take longer than the training (policies that plan).
     """
 
     name: str
@@ -23,12 +24,14 @@ class Row:
     learner: dict[str, Any] = dataclasses.field(default_factory=dict)
     loop_options: dict[str, Any] = dataclasses.field(default_factory=dict)
     num_envs: int | None = None
+    eval_episodes: int | None = None
 
 
 ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 _VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
 _DQN = "rewardtogo.value.dqn:DQN"
 _ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
+_ONE_MODEL = {"members": 1, "probabilistic": False, "bootstrap": False, "propagation": "mean"}
 _EVERY_STEP = {"unroll": 1, "batch_size": 256, "replay": {"capacity": 1_000_000}}
 
 ALGORITHMS: dict[str, Row] = {
@@ -138,6 +141,52 @@ ALGORITHMS: dict[str, Row] = {
                 "value_learning_rate": 1e-3,
             }
             | {"normalise_advantages": False, "max_grad_norm": 0.5},
+        ),
+        *(
+            Row(
+                name,
+                "rewardtogo.model_based.mbrl:ModelBased",
+                "off_policy",
+                "8",
+                number,
+                ("discrete", "multi_discrete", "box"),
+                summary,
+                learner,
+                {"unroll": 50, "updates": 200, "batch_size": 128, "warm_up": 200, "replay": {"capacity": 100_000}}
+                | loop,
+                1,
+                4,
+            )
+            for name, number, summary, learner, loop in (
+                (
+                    "mbrl_v05",
+                    "Alg 19",
+                    "fit a model to random data once and for all, plan through it",
+                    _ONE_MODEL | {"acting": "random", "every": 15},
+                    {},
+                ),
+                (
+                    "mbrl_v1",
+                    "Alg 20",
+                    "fit a model, carry out whole plans, fit it again to what happened",
+                    _ONE_MODEL | {"every": 15},
+                    {},
+                ),
+                (
+                    "mbrl_v15",
+                    "Alg 21",
+                    "fit a model, replan at every step, fit it again every N steps",
+                    _ONE_MODEL,
+                    {},
+                ),
+                (
+                    "pets",
+                    "8.3.3",
+                    "replanning through an ensemble of probabilistic models, by sampled trajectories",
+                    {},
+                    {},
+                ),
+            )
         ),
         Row(
             "npg",

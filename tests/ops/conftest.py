@@ -10,9 +10,3 @@ import pytest
 def strict_promotion() -> Iterator[None]:
     with jax.numpy_dtype_promotion("strict"):
         yield
-
-
-@pytest.fixture
-def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield

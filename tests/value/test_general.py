@@ -222,12 +222,6 @@ def test_polyak_averages_forget_at_their_rate(item):
         check(abs(wrong - float(after[0])), ">", 1, "with p for tau the target jumps to the network at once")
 
 
-@pytest.fixture
-def x64():
-    with jax.enable_x64(True):
-        yield
-
-
 def test_lag_of_targets(item):
     """How many updates old the parameters in a target are: simulated, against the closed forms."""
     period, updates = 40, 100_000

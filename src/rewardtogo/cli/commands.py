@@ -310,6 +310,30 @@ def _solve(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
         print(draw_solution(found, given.out), file=sys.stderr if given.json else sys.stdout)
 
 
+def _plan(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    from ..runner.look_ahead import plan_by_name, report
+    from ..runner.play import require_film
+
+    if given.env is None:
+        raise RequestError("which environment? Such as rtg plan ilqr Pendulum-v1")
+    if given.out:
+        require_film(Path(given.out))
+    played = plan_by_name(
+        given.planner,
+        given.env,
+        horizon=given.horizon,
+        every=given.every,
+        episodes=given.episodes,
+        seed=given.seed,
+        gamma=given.gamma,
+        options=groups["planner"],
+    )
+    print(json.dumps(played.to_json()) if given.json else report(played))
+    if given.out:
+        path, total, length = played.film(given.out, given.seed)
+        print(f"{path}: return {total:.1f} in {length} steps", file=sys.stderr if given.json else sys.stdout)
+
+
 def show_options(algorithm: str) -> None:
     """Print every hyperparameter of an algorithm and of its loop: default, range, meaning."""
     row = None if ":" in algorithm else algorithm_row(algorithm)
@@ -317,19 +341,27 @@ def show_options(algorithm: str) -> None:
     if row is not None:
         parts.append(("loop", resolve(LOOPS[row.loop]), row.loop_options))
     for title, owner, settings in parts:
-        print(f"\n{title} ({owner.__name__}):")
-        for name, field in options(owner).items():
-            span = field.metadata.get("range")
-            limits = f"  {span}" if span is not None and str(span) != "(-inf, inf)" else ""
-            print(
-                f"  --{title}.{name.replace('_', '-')} {_shown(settings.get(name, field.default))}{limits}\n      {field.metadata['doc']}"
-            )
-            if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
-                chosen = part_of(name, field, settings.get(name, field.default))
-                for inner in options(type(chosen)):
-                    print(
-                        f"      --{title}.{name.replace('_', '-')}.{inner.replace('_', '-')} {_shown(getattr(chosen, inner))}"
-                    )
+        _show(title, owner, settings)
+
+
+def show_planner(planner: str) -> None:
+    """Print every setting of a planner."""
+    from ..planning.mpc import PLANNERS
+
+    _show("planner", *PLANNERS[planner])
+
+
+def _show(title: str, owner: type, settings: dict[str, Any]) -> None:
+    print(f"\n{title} ({owner.__name__}):")
+    for name, field in options(owner).items():
+        span = field.metadata.get("range")
+        limits = f"  {span}" if span is not None and str(span) != "(-inf, inf)" else ""
+        flag = f"--{title}.{name.replace('_', '-')}"
+        print(f"  {flag} {_shown(settings.get(name, field.default))}{limits}\n      {field.metadata['doc']}")
+        if dataclasses.is_dataclass(field.default) and type(field.default) in PARTS.values():
+            chosen = part_of(name, field, settings.get(name, field.default))
+            for inner in options(type(chosen)):
+                print(f"      {flag}.{inner.replace('_', '-')} {_shown(getattr(chosen, inner))}")
 
 
 def _shown(value: Any) -> str:
@@ -357,5 +389,6 @@ COMMANDS = {
     "collect": _collect,
     "export": _export,
     "figure": _figure,
+    "plan": _plan,
     "solve": _solve,
 }

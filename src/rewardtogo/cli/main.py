@@ -25,6 +25,18 @@ SOLVERS = (
 )
 
 
+PLANNERS = (
+    "random_shooting",
+    "cem",
+    "mppi",
+    "gradient_shooting",
+    "newton_shooting",
+    "ilqr",
+    "ddp",
+    "collocation",
+)
+
+
 class RequestError(Exception):
     """A request that cannot be met, in one sentence."""
 
@@ -217,6 +229,20 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     p.add_argument("--out", metavar="FILE.png|.svg", help="also draw the values and the policy")
     p.add_argument("--json", action="store_true")
+    p = command(
+        "plan",
+        "play an environment by planning in its own dynamics, replanning as it goes",
+        epilog="`rtg plan PLANNER --help` shows the planner's own options",
+    )
+    p.add_argument("planner", metavar="PLANNER", help="; ".join(PLANNERS))
+    p.add_argument("env", metavar="ENV", nargs="?", help="a compiled environment, such as Pendulum-v1 or CartPole-v1")
+    p.add_argument("--horizon", type=_whole, default=25, metavar="H", help="actions in a plan (default 25)")
+    p.add_argument("--every", type=_whole, default=1, metavar="N", help="actions done before the next plan (default 1)")
+    p.add_argument("--episodes", type=_episodes, default=10)
+    p.add_argument("--gamma", type=_number, default=1.0, metavar="G", help="discount of a plan's rewards (default 1)")
+    p.add_argument("--seed", type=_seed, default=0)
+    p.add_argument("--out", metavar="FILE.gif|.mp4", help="also draw an episode")
+    p.add_argument("--json", action="store_true")
     p = command("figure", "redraw a figure or experiment of the notes")
     p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
     p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
@@ -318,6 +344,16 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
     elif arguments[0] == "solve" and not any(a in ("-h", "--help") for a in arguments):
         options, rest = table["solve"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("env",), "solve")
+    elif arguments[0] == "plan":
+        if any(a in ("-h", "--help") for a in arguments):
+            table["plan"].print_help()
+            if len(arguments) > 1 and arguments[1] in PLANNERS:
+                from .commands import show_planner
+
+                show_planner(arguments[1])
+            return 0
+        options, rest = table["plan"].parse_known_args(arguments[1:])
+        groups = _nested(rest, ("planner",), "plan")
     else:
         options = _known(table[arguments[0]], arguments[1:])
     options.arguments = arguments

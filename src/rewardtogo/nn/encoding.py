@@ -91,10 +91,14 @@ class RunningNorm(eqx.Module):
             square[name] = self.square[name] + within + gap**2 * (self.count * new / total)
         return RunningNorm(mean, square, total, self.limit)
 
+    def sd(self, name: str = "") -> Array:
+        """Standard deviation of a part (1 before anything was seen), a little more than 0."""
+        variance = jnp.where(self.count > 1, self.square[name] / jnp.maximum(self.count, 1.0), 1.0)
+        return jnp.sqrt(variance + 1e-8)
+
     def __call__(self, observation: Observation) -> Observation:
         def scaled(name: str) -> Array:
-            variance = jnp.where(self.count > 1, self.square[name] / jnp.maximum(self.count, 1.0), 1.0)
-            z = (leaf(observation, name) - self.mean[name]) / jnp.sqrt(variance + 1e-8)
+            z = (leaf(observation, name) - self.mean[name]) / self.sd(name)
             return jnp.clip(z, -self.limit, self.limit)
 
         if not isinstance(observation, dict):

@@ -7,6 +7,29 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .cross_entropy import cem as cem
+    from .cross_entropy import mppi as mppi
+    from .identification import identify as identify
+    from .iterated_lqr import ilqr as ilqr
+    from .linear_quadratic import LinearController as LinearController
+    from .linear_quadratic import LQProblem as LQProblem
+    from .linear_quadratic import Regulator as Regulator
+    from .linear_quadratic import lqr as lqr
+    from .linear_quadratic import lqr_infinite as lqr_infinite
+    from .linear_quadratic import riccati as riccati
+    from .mpc import ILQR as ILQR
+    from .mpc import MPC as MPC
+    from .mpc import PLANNERS as PLANNERS
+    from .mpc import Collocation as Collocation
+    from .mpc import CrossEntropy as CrossEntropy
+    from .mpc import GradientShooting as GradientShooting
+    from .mpc import NewtonShooting as NewtonShooting
+    from .mpc import PathIntegral as PathIntegral
+    from .mpc import Planner as Planner
+    from .mpc import RandomShooting as RandomShooting
+    from .open_loop import best_open_loop as best_open_loop
+    from .open_loop import open_loop_return as open_loop_return
+    from .open_loop import open_loop_returns as open_loop_returns
     from .problem import FunctionProblem as FunctionProblem
     from .problem import ModelProblem as ModelProblem
     from .problem import Plan as Plan
@@ -16,10 +39,22 @@ if TYPE_CHECKING:
     from .problem import rollout as rollout
     from .problem import total_cost as total_cost
     from .problem import why as why
-    from .problem import with_horizon as with_horizon
+    from .shooting import gradient_shooting as gradient_shooting
+    from .shooting import newton_shooting as newton_shooting
+    from .shooting import random_shooting as random_shooting
+    from .shooting import shooting_hessian as shooting_hessian
+    from .sqp import collocation as collocation
 
 _HOMES = {
-    "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why with_horizon",
+    "identification": "identify",
+    "open_loop": "best_open_loop open_loop_return open_loop_returns",
+    "sqp": "collocation",
+    "cross_entropy": "cem mppi",
+    "iterated_lqr": "ilqr",
+    "mpc": "MPC PLANNERS Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
+    "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
+    "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
+    "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 

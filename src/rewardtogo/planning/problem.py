@@ -11,10 +11,9 @@ through H + 1 states. Every planner takes a `Problem` and gives a `Solution` who
     ModelProblem      from a `Model`, known or learned: c = -r, and nothing more to pay after a terminal state
 """
 
-import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -73,8 +72,19 @@ def whole(value: Any) -> int:
 class Problem(eqx.Module):
     """Minimise a sum of costs over `horizon` actions of the kind that `action` says."""
 
-    horizon: eqx.AbstractVar[int]
-    action: eqx.AbstractVar[Spec]
+    @property
+    @abstractmethod
+    def horizon(self) -> int:
+        """H: how many actions there are to choose."""
+
+    @property
+    @abstractmethod
+    def action(self) -> Spec:
+        """Kind, shape and bounds of u."""
+
+    @abstractmethod
+    def with_horizon(self, horizon: int) -> "Problem":
+        """The same problem with another number of actions. Raises `ValueError` for less than one."""
 
     @abstractmethod
     def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Float[Array, ""]]:
@@ -85,16 +95,8 @@ class Problem(eqx.Module):
         """c_H(x_H)."""
 
 
-AnyProblem = TypeVar("AnyProblem", bound=Problem)
-
-
-def with_horizon(problem: AnyProblem, horizon: int) -> AnyProblem:
-    """The same problem with another number of actions. Raises `ValueError` for less than one."""
-    return dataclasses.replace(problem, horizon=whole(horizon))
-
-
 class FunctionProblem(Problem):
-    """A problem from functions:
+    """A problem from functions, in five lines.
 
         problem = rtg.FunctionProblem(f, c, horizon=50, action=2)
         solution = rtg.ilqr(problem, x0)
@@ -108,14 +110,38 @@ class FunctionProblem(Problem):
     give an Equinox module that holds it.
     """
 
-    dynamics: Callable = eqx.field(converter=as_module)
-    running: Callable = eqx.field(converter=as_module)
-    horizon: int = eqx.field(static=True, converter=whole)
-    action: Spec = eqx.field(static=True, converter=lambda a: box(a) if isinstance(a, (int, np.integer)) else a)
-    final: Callable | None = eqx.field(default=None, converter=as_module)
-    timed: bool = eqx.field(default=False, static=True)
+    dynamics: Callable
+    running: Callable
+    final: Callable | None
+    steps: int = eqx.field(static=True)
+    controls: Spec = eqx.field(static=True)
+    timed: bool = eqx.field(static=True)
 
-    def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Float[Array, ""]]:
+    def __init__(
+        self,
+        dynamics: Callable,
+        running: Callable,
+        horizon: int,
+        action: int | Spec,
+        final: Callable | None = None,
+        timed: bool = False,
+    ):
+        self.dynamics, self.running, self.final = as_module(dynamics), as_module(running), as_module(final)
+        self.steps, self.timed = whole(horizon), timed
+        self.controls = action if isinstance(action, Spec) else box(int(action))
+
+    @property
+    def horizon(self) -> int:
+        return self.steps
+
+    @property
+    def action(self) -> Spec:
+        return self.controls
+
+    def with_horizon(self, horizon: int) -> "FunctionProblem":
+        return FunctionProblem(self.dynamics, self.running, horizon, self.controls, self.final, self.timed)
+
+    def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Array]:
         del key
         arguments = (state, action, t) if self.timed else (state, action)
         return self.dynamics(*arguments), self.running(*arguments)
@@ -131,10 +157,27 @@ class ModelProblem(Problem):
     """
 
     model: Model
-    horizon: int = eqx.field(static=True, converter=whole)
-    action: Spec = eqx.field(static=True)
-    discount: ScalarLike = 1.0
-    final: Callable | None = eqx.field(default=None, converter=as_module)
+    discount: ScalarLike
+    final: Callable | None
+    steps: int = eqx.field(static=True)
+    controls: Spec = eqx.field(static=True)
+
+    def __init__(
+        self, model: Model, horizon: int, action: Spec, discount: ScalarLike = 1.0, final: Callable | None = None
+    ):
+        self.model, self.discount, self.final = model, discount, as_module(final)
+        self.steps, self.controls = whole(horizon), action
+
+    @property
+    def horizon(self) -> int:
+        return self.steps
+
+    @property
+    def action(self) -> Spec:
+        return self.controls
+
+    def with_horizon(self, horizon: int) -> "ModelProblem":
+        return ModelProblem(self.model, horizon, self.controls, self.discount, self.final)
 
     def step(self, state: State, action: Action, t: Array | int, key: PRNGKey) -> tuple[State, Float[Array, ""]]:
         over = self.model.terminal(state)
@@ -159,17 +202,27 @@ def box(size: int, low: Any = -np.inf, high: Any = np.inf) -> Spec:
     try:
         bounds = [np.broadcast_to(np.asarray(bound, np.float64), (size,)) for bound in (low, high)]
     except ValueError:
-        raise ValueError(f"the bounds of {size} numbers are a number or {size} of them each, not {low} and {high}") from None
+        raise ValueError(
+            f"the bounds of {size} numbers are a number or {size} of them each, not {low} and {high}"
+        ) from None
     if np.any(np.isnan(bounds)) or np.any(bounds[0] >= bounds[1]):
         raise ValueError(f"a lower bound must lie below the upper one, and {low} and {high} do not")
     return Spec("box", (int(size),), low=tuple(bounds[0].tolist()), high=tuple(bounds[1].tolist()))
 
 
+def typed(problem: Problem, state: Any, action: Any) -> State:
+    """The state in the types that a step gives it: float32 becomes float64 where the dynamics are."""
+    following = jax.eval_shape(lambda x, u: problem.step(x, u, 0, jax.random.key(0))[0], state, action)
+    return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), state, following)
+
+
+@jax.jit
 def rollout(
-    problem: Problem, state: State, actions: Action, key: PRNGKey | None = None
+    problem: Problem, state: Any, actions: Any, key: PRNGKey | None = None
 ) -> tuple[State, Float[Array, "H"], Float[Array, ""]]:
     """Follow a plan: states `[H + 1, *X]`, the costs of the H actions, and the final cost."""
     keys = jax.random.split(jax.random.key(0) if key is None else key, problem.horizon)
+    state = typed(problem, state, jax.tree.map(lambda u: u[0], actions))
 
     def step(x: State, now: tuple[Action, Array, PRNGKey]) -> tuple[State, tuple[State, Array]]:
         u, t, k = now
@@ -181,15 +234,15 @@ def rollout(
     return states, costs, problem.final_cost(last)
 
 
-def total_cost(problem: Problem, state: State, actions: Action, key: PRNGKey | None = None) -> Float[Array, ""]:
+@jax.jit
+def total_cost(problem: Problem, state: Any, actions: Any, key: PRNGKey | None = None) -> Float[Array, ""]:
     """J(u_0, ..., u_{H-1}) from a state (items 8.3, 8.26); with random dynamics one sample of it."""
     _, costs, final = rollout(problem, state, actions, key)
     return costs.sum() + final
 
 
-def plan_of(
-    problem: Problem, state: State, actions: Action, key: PRNGKey | None = None, gains: Array | None = None
-) -> Plan:
+@jax.jit
+def plan_of(problem: Problem, state: Any, actions: Any, key: PRNGKey | None = None, gains: Array | None = None) -> Plan:
     """The plan of a sequence of actions, followed and its cost counted."""
     states, costs, final = rollout(problem, state, actions, key)
     return Plan(actions, states, costs.sum() + final, gains)

@@ -20,6 +20,15 @@ from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..nn import CNN, GRU, LSTM, MLP, Autoregressive, Latent, Mixture, Network, Stacked, Standard
 from ..ops.schedules import parse_schedule, to_text
+from ..planning.mpc import (
+    ILQR,
+    Collocation,
+    CrossEntropy,
+    GradientShooting,
+    NewtonShooting,
+    PathIntegral,
+    RandomShooting,
+)
 from ..value.exploration import Boltzmann, EpsilonGreedy, Greedy
 from ..value.maximisers import CEM, Ascent, Sampled
 from ..value.noise import OU, Gaussian
@@ -31,7 +40,8 @@ _NETWORKS = (MLP, CNN, GRU, LSTM, Stacked)
 _HEADS = (Standard, Mixture, Autoregressive, Latent)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
-PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES)}
+_PLANNERS = (RandomShooting, CrossEntropy, PathIntegral, GradientShooting, NewtonShooting, ILQR, Collocation)
+PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES, *_PLANNERS)}
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 

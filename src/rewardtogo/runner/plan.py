@@ -24,8 +24,8 @@ from .policy import restore_learner
 
 DEFAULT_STEPS = 100_000
 MOST_ITERATIONS, MOST_HOSTED = 2**31 - 1, 10_000
-ROWS, EVALUATIONS = 200, 10
-"""How many rows of metrics and how many evaluations a run has, about."""
+ROWS, EVALUATIONS, EVAL_EPISODES = 200, 10, 20
+"""How many rows of metrics and how many evaluations a run has, about, and episodes an evaluation."""
 
 
 @dataclasses.dataclass
@@ -62,13 +62,15 @@ def plan(
     env_kwargs: dict[str, Any] | None = None,
     preset: str = "auto",
     data: Any = None,
-    eval_episodes: int = 20,
+    eval_episodes: int | None = None,
     evaluations: int = EVALUATIONS,
 ) -> Plan:
     """Put a run together. Raises `ValueError` with one sentence for whatever cannot be, before anything is compiled or written."""
     name = algorithm if isinstance(algorithm, str) else _name_of(algorithm)
     env_name = env if isinstance(env, str) else _title(env)
     ready = _preset(preset, name, env_name)
+    known_row = ALGORITHMS.get(name)
+    eval_episodes = eval_episodes or (known_row and known_row.eval_episodes) or EVAL_EPISODES
     env_kwargs = merge(ready.get("env", {}), env_kwargs or {})
     check_budget(steps, seed)
     _check_num_envs(num_envs, env, backend, env_kwargs)

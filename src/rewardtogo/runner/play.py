@@ -52,10 +52,28 @@ def play(
     folder = RunFolder(run)
     config = folder.config()
     path = Path(out) if out is not None else folder.path / "episode.gif"
+    require_film(path)
+    policy = load(folder.path, learner, checkpoint)
+    return film_of(policy, config["env"], path, seed, stochastic, env)
+
+
+def require_film(path: Path) -> None:
+    """Raise `ValueError` for a file that is no film by its ending."""
     if path.suffix.lower() not in ENDINGS:
         raise ValueError(f"a film is written to a file ending in {' or '.join(ENDINGS)}, not to {path}")
-    policy = load(folder.path, learner, checkpoint)
-    drawn = _drawable(config["env"], env)
+
+
+def film_of(
+    policy: LoadedPolicy,
+    described: dict[str, Any],
+    path: Path,
+    seed: int = 0,
+    stochastic: bool = False,
+    env: gymnasium.Env | Callable[..., gymnasium.Env] | None = None,
+) -> tuple[Path, float, int]:
+    """An episode of a policy as a film. `described`: the environment as `config.json` has it."""
+    require_film(path)
+    drawn = _drawable(described, env)
     try:
         with _Film(path, float(drawn.metadata.get("render_fps") or 30)) as film:
             total, length = _episode(drawn, policy, seed, stochastic, film)

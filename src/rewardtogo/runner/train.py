@@ -38,6 +38,11 @@ FINAL_EPISODES = 100
 MOST_SEEDS = 10_000
 
 
+def final_episodes(episodes: int) -> int:
+    """Of the evaluation at the end, given those of one on the way: less where a policy is so slow that even these are few."""
+    return min(FINAL_EPISODES, 5 * episodes)
+
+
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM: a checkpoint was written, and the run can be resumed."""
 
@@ -134,7 +139,9 @@ class Session:
         self.key = self.program.key
         episodes = plan.config["eval_episodes"]
         self.evaluator = (
-            None if plan.eval_env is None else Evaluator(plan.eval_env, episodes, self.batched, FINAL_EPISODES)
+            None
+            if plan.eval_env is None
+            else Evaluator(plan.eval_env, episodes, self.batched, final_episodes(episodes))
         )
         self.sinks: list[list[Sink]] = [
             [CSV(f), *(SINKS[name](f, plan.config) for name in sinks)] for f in self.folders
@@ -306,8 +313,8 @@ class Session:
         results: list[dict[str, Any] | None] = [None] * len(self.seeds)
         if self.evaluator is not None:
             key = jax.random.fold_in(jax.random.key(self.seeds[0] ^ 0x5EED), 2**31 - 1)
-            greedy = self.evaluator(self._policy(moment.state, False), key, FINAL_EPISODES)
-            explore = self.evaluator(self._policy(moment.state, True), key, FINAL_EPISODES)
+            greedy = self.evaluator(self._policy(moment.state, False), key, final_episodes(self.evaluator.episodes))
+            explore = self.evaluator(self._policy(moment.state, True), key, final_episodes(self.evaluator.episodes))
             for k in range(len(self.seeds)):
                 pick = lambda found, k=k: [x[k] if self.batched else x for x in found]  # noqa: E731
                 results[k] = {
