@@ -39,15 +39,23 @@ if TYPE_CHECKING:
     from .envs.registry import make as make
     from .envs.vectorize import vectorize as vectorize
     from .imitation.bc import BC as BC
+    from .imitation.dagger import DAgger as DAgger
+    from .imitation.experts import Fallible as Fallible
+    from .imitation.experts import as_expert as as_expert
     from .loops.collect import collect as collect
     from .loops.off_policy import OffPolicy as OffPolicy
     from .loops.offline import Offline as Offline
     from .loops.on_policy import OnPolicy as OnPolicy
     from .model_based.mbrl import ModelBased as ModelBased
+    from .nn.autoregressive import Autoregressive as Autoregressive
+    from .nn.heads import Standard as Standard
+    from .nn.latent import Latent as Latent
+    from .nn.mixture import Mixture as Mixture
     from .nn.network import CNN as CNN
     from .nn.network import MLP as MLP
     from .nn.recurrent import GRU as GRU
     from .nn.recurrent import LSTM as LSTM
+    from .nn.stacked import Stacked as Stacked
     from .policy_gradient.npg import NPG as NPG
     from .policy_gradient.off_policy import OffPolicyPG as OffPolicyPG
     from .policy_gradient.ppo import PPO as PPO
@@ -87,13 +95,20 @@ _HOMES = {
     "envs.registry": "make",
     "envs.vectorize": "vectorize",
     "imitation.bc": "BC",
+    "imitation.dagger": "DAgger",
+    "imitation.experts": "Fallible as_expert",
     "loops.collect": "collect",
     "loops.off_policy": "OffPolicy",
     "loops.offline": "Offline",
     "loops.on_policy": "OnPolicy",
     "model_based.mbrl": "ModelBased",
+    "nn.autoregressive": "Autoregressive",
+    "nn.heads": "Standard",
+    "nn.latent": "Latent",
+    "nn.mixture": "Mixture",
     "nn.network": "CNN MLP",
     "nn.recurrent": "GRU LSTM",
+    "nn.stacked": "Stacked",
     "policy_gradient.npg": "NPG",
     "policy_gradient.off_policy": "OffPolicyPG",
     "policy_gradient.ppo": "PPO",

@@ -47,6 +47,26 @@ ALGORITHMS: dict[str, Row] = {
             "behavioural cloning: maximum likelihood of an expert's actions",
         ),
         Row(
+            "dagger",
+            "rewardtogo.imitation.bc:BC",
+            "dagger",
+            "2",
+            "Alg 1",
+            ANY,
+            "dataset aggregation: an expert labels the states that the learner comes to",
+        ),
+        Row(
+            "dart",
+            "rewardtogo.imitation.bc:BC",
+            "dagger",
+            "2",
+            "2.2",
+            ANY,
+            "an expert who drives with as much noise as the learner has error, so that it shows the way back",
+            {},
+            {"beta": 1.0, "noise": 0.1, "adapt_noise": True},
+        ),
+        Row(
             "reinforce",
             _VANILLA,
             "on_policy",
@@ -425,6 +445,7 @@ LOOPS = {
     "on_policy": "rewardtogo.loops.on_policy:OnPolicy",
     "off_policy": "rewardtogo.loops.off_policy:OffPolicy",
     "offline": "rewardtogo.loops.offline:Offline",
+    "dagger": "rewardtogo.imitation.dagger:DAgger",
     "asynchronous": "rewardtogo.actor_critic.asynchronous:Asynchronous",
 }
 

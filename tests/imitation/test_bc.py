@@ -281,3 +281,67 @@ def test_replaying_is_acting(echo, key):
 def test_what_is_refused(make_learner, action, words, key):
     with pytest.raises(ValueError, match=words):
         make_learner().init(spec_of(spaces.Box(-1.0, 1.0, (1,)), action), key)
+
+
+# --- validation --------------------------------------------------------------------------------------------------------
+
+
+def test_held_out_episodes_are_never_learnt_from(key):
+    """Rows of whole episodes in two parts, and batches from the right one."""
+    from rewardtogo.loops.offline import split_rows
+
+    spec = spec_of(spaces.Box(0.0, 60.0, (1,)), spaces.Discrete(3))
+    number = jnp.arange(60.0)[:, None]
+    data = steps(number, jnp.zeros(60, jnp.int32), spec)
+    rows, train = jax.jit(lambda t, k: split_rows(t, 0.3, k))(data.transitions, key)
+    assert int(train) == 40 and sorted(np.asarray(rows).tolist()) == list(range(60))
+    parts = [set((np.asarray(part) // 10).tolist()) for part in (rows[: int(train)], rows[int(train) :])]
+    assert [len(p) for p in parts] == [4, 2] and not parts[0] & parts[1]
+    assert np.all(np.diff(np.asarray(rows[: int(train)])) > 0)
+    algorithm = Offline(data, BC(network=MLP(4)), batch_size=64, validation=0.3)
+    state = jax.jit(lambda a, k: a.init(k))(algorithm, key)
+    for training in (True, False):
+        batch = algorithm._batch(state.learner, state.held_out, training, key)
+        chosen = set((np.asarray(batch.transitions.observation)[:, 0] // 10).astype(int).tolist())
+        held = set((np.asarray(state.held_out.rows)[int(state.held_out.train) :] // 10).tolist())
+        assert chosen == held if not training else not chosen & held
+
+
+def test_the_policy_is_the_best_on_held_out_data_and_learning_stops(key, item):
+    """Labels without a rule: what is learnt of them is of no use for others, and the first policies are the best."""
+    spec = spec_of(spaces.Box(-1.0, 1.0, (4,)), spaces.Discrete(2))
+    one, two = jax.random.split(key)
+    data = steps(jax.random.uniform(one, (60, 4)), jax.random.randint(two, (60,), 0, 2), spec)
+    learner = BC(network=MLP(64), learning_rate=0.03)
+    algorithm = Offline(data, learner, batch_size=40, updates=5, validation=0.3, patience=5)
+    state, metrics = run(algorithm, key, 40)
+    loss, best, stopped = (np.asarray(metrics[n]) for n in ("validation_loss", "best_validation_loss", "stopped"))
+    with item("2.1") as check:
+        check(
+            best[-1], "==", loss[: int(np.argmax(stopped > 0))].min(), "validation loss of the policy that is returned"
+        )
+        check(stopped[-1], "==", 1, "learning has stopped")
+        check(stopped.sum(), ">=", 20, "iterations in which nothing was learnt any more")
+    assert np.array_equal(stopped, np.sort(stopped))
+    differs = [
+        not np.array_equal(a, b)
+        for a, b in zip(*map(jax.tree.leaves, (state.learner, algorithm.learned(state))), strict=True)
+    ]
+    assert any(differs)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"validation": 1.0}, r"Offline.validation must be in \[0, 1\), not 1.0"),
+        ({"patience": 3}, "early stopping looks at held-out episodes"),
+        ({"validation": 0.2, "monitor": "no_such"}, "has no metric 'no_such' to validate by: name one of bc_loss"),
+    ],
+)
+def test_what_validation_refuses(options, words, choices, key):
+    data, _ = choices
+    with pytest.raises(ValueError, match=words):
+        algorithm = Offline(data, BC(network=MLP(4)), **options)
+        jax.eval_shape(algorithm.step, jax.eval_shape(algorithm.init, key), key)
+    with pytest.raises(ValueError, match="a dataset of one episode cannot be split"):
+        Offline(data.take([0]), BC(network=MLP(4)), validation=0.5)

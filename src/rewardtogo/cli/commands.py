@@ -76,6 +76,7 @@ def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
         backend=given.backend,
         preset=given.preset,
         data=given.data,
+        expert=given.expert,
         command=["rtg", *given.arguments],
         **extra,
         **_limits(given),
@@ -166,7 +167,7 @@ def _report(given: argparse.Namespace, found: Run | list[Run]) -> None:
 def _resume(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     del groups
     learner = _learner_for(given.run, given.learner_class)
-    _report(given, resume(given.run, steps=given.steps, learner=learner, **_limits(given)))
+    _report(given, resume(given.run, steps=given.steps, learner=learner, expert=given.expert, **_limits(given)))
 
 
 def _learner_for(run: str, path: str | None) -> Any:

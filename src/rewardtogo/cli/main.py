@@ -148,6 +148,11 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     p.add_argument("--data", metavar="DATASET", help="a dataset to learn from, made by `rtg collect`")
     p.add_argument(
+        "--expert",
+        metavar="RUN|MODULE:FUNCTION",
+        help="whom dagger and dart ask: a run, or a function of an observation",
+    )
+    p.add_argument(
         "--profile",
         action="store_true",
         help="afterwards, say what share of the time collection, learning and evaluation take",
@@ -158,6 +163,7 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument(
         "--learner-class", metavar="MODULE:CLASS", help="the learner of a run that is not part of the library"
     )
+    p.add_argument("--expert", metavar="RUN|MODULE:FUNCTION", help="the expert of the run, where it is code")
     limits(p)
     p = command("eval", "play whole episodes and print the mean return with its confidence interval")
     run_argument(p)

@@ -13,13 +13,14 @@ from .. import presets
 from ..catalogue import ALGORITHMS, LOOPS, algorithm_row
 from ..core import Algorithm, Environment, Learner, VectorEnv, env_spec
 from ..data.checks import require_spec
-from ..data.episodes import load_dataset
+from ..data.episodes import Dataset, load_dataset
 from ..envs.gymnasium import hosted
 from ..envs.registry import COMPILED, make
 from ..envs.vectorize import Vectorized, vectorize
 from .config import build, describe, merge, override, resolve
 from .engine import iterations_for, steps_after
 from .evaluate import lanes_for
+from .experts import expert_of, is_code
 from .policy import restore_learner
 
 DEFAULT_STEPS = 100_000
@@ -62,6 +63,7 @@ def plan(
     env_kwargs: dict[str, Any] | None = None,
     preset: str = "auto",
     data: Any = None,
+    expert: Any = None,
     eval_episodes: int | None = None,
     evaluations: int = EVALUATIONS,
 ) -> Plan:
@@ -88,15 +90,17 @@ def plan(
         inner = _learner(algorithm, merge(known, learner or {}))
         options = merge(merge({} if row is None else row.loop_options, ready.get("loop", {})), loop or {})
         kind = row.loop if row is not None else ("on_policy" if inner.batch == "rollout" else "off_policy")
-        if data is not None:
+        if data is not None and kind != "dagger":
             kind, options = "offline", loop or {}
+        if expert is not None and kind != "dagger":
+            raise ValueError(f"{name} asks no expert: leave the expert out, or use dagger")
         cls = resolve(LOOPS[kind])
         if kind == "offline":
             if data is None:
                 raise ValueError(
                     f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
                 )
-            dataset = load_dataset(data) if isinstance(data, (str, Path)) else data
+            dataset = _dataset(data)
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **env_kwargs)  # type: ignore[arg-type]
             if vector_env is not None:
                 require_spec(dataset.spec, env_spec(vector_env), "the data")
@@ -115,7 +119,8 @@ def plan(
                     f"{name} acts with several policies in one compiled program, which an environment outside of it ({env_name}) "
                     "cannot follow: use one of `rtg list --envs`, or a2c"
                 )
-            whole = build(cls, options, env=vector_env, learner=inner)
+            more = _imitation(name, expert, data, vector_env) if kind == "dagger" else {}
+            whole = build(cls, options, env=vector_env, learner=inner, **more)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
     iterations = _iterations(whole, steps)
     row_every = max(1, iterations // ROWS)
@@ -134,6 +139,7 @@ def plan(
         "learner": describe(inner) if inner is not None else {},
         "loop": describe(whole),
         "data": str(data) if isinstance(data, (str, Path)) else None,
+        "expert": str(expert) if isinstance(expert, (str, Path)) else None,
         "seed": seed,
         "steps": steps_after(whole, iterations),
         "iterations": iterations,
@@ -145,7 +151,9 @@ def plan(
     return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs, eval_episodes), config)
 
 
-def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, learner: Learner | None = None) -> Plan:
+def from_config(
+    config: dict[str, Any], *, steps: int | None, env: Any = None, learner: Learner | None = None, expert: Any = None
+) -> Plan:
     """The run that a folder's configuration describes, with a longer budget if `steps` is given."""
     described = config["env"]
     if env is None and not described["by_name"] and described["num_envs"]:
@@ -172,7 +180,10 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
         whole: Algorithm = build(cls, config["loop"], dataset=load_dataset(config["data"]), learner=inner)
     else:
         vector_env = make(source, described["num_envs"], backend=backend, **described["kwargs"])
-        whole = build(cls, config["loop"], env=vector_env, learner=inner)
+        more = {}
+        if kind == LOOPS["dagger"]:
+            more = _imitation(config["algorithm"], _same_expert(config, expert), config["data"], vector_env)
+        whole = build(cls, config["loop"], env=vector_env, learner=inner, **more)
     config = dict(config)
     if steps is not None:
         check_budget(steps, config["seed"])
@@ -184,6 +195,33 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
         config |= {"iterations": iterations, "steps": steps_after(whole, iterations)}
     eval_env = _evaluation_env(source, vector_env, backend, described["kwargs"], config["eval_episodes"])
     return Plan(whole, inner, vector_env, eval_env, config)
+
+
+def _dataset(data: Any) -> Dataset:
+    return load_dataset(data) if isinstance(data, (str, Path)) else data
+
+
+def _imitation(name: str, expert: Any, data: Any, env: VectorEnv) -> dict[str, Any]:
+    """What a learner that asks needs besides an environment."""
+    if expert is None:
+        raise ValueError(
+            f"{name} learns from an expert's answers: name one with --expert RUN or --expert module:function"
+        )
+    return {
+        "expert": expert_of(expert, env_spec(env)),
+        "demonstrations": None if data is None else _dataset(data),
+    }
+
+
+def _same_expert(config: dict[str, Any], expert: Any) -> Any:
+    """The expert that is given again, or the run that the configuration names."""
+    described = config.get("expert")
+    if expert is None and (described is None or is_code(described)):
+        which = f"code ({described})" if described else "an object"
+        raise ValueError(
+            f"the run's expert is {which}, which a file may not name: give it again with --expert, or rtg.resume(path, expert=...)"
+        )
+    return described if expert is None else expert
 
 
 def check_budget(steps: Any, seed: Any) -> None:

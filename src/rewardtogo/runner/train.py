@@ -359,6 +359,7 @@ def train(
     env_kwargs: dict[str, Any] | None = None,
     preset: str = "auto",
     data: Any = None,
+    expert: Any = None,
     stop_at_return: float | None = None,
     time_limit: float | None = None,
     checkpoint_every: float = 60.0,
@@ -374,6 +375,8 @@ def train(
     - `steps`: environment steps (gradient steps offline), rounded up to whole iterations.
     - `num_seeds`: trains seeds `seed, seed + 1, ...`: in one program where the environment is compiled, else one after another.
     - `learner`, `loop`: hyperparameters by name; they win over the preset's.
+    - `data`: a dataset, or its folder; `expert`: for dagger and dart, a run's folder, `"module:function"`, a function of an
+      observation or a `Policy`.
     - `callbacks`: see `rtg.run`; `sinks`: of `"tensorboard"` and `"wandb"`, besides `metrics.csv`.
 
     Returns a `Run`, or a list of them with several seeds. Raises `ValueError` for a request that cannot be met, `Interrupted` after
@@ -395,6 +398,7 @@ def train(
         env_kwargs=env_kwargs,
         preset=preset,
         data=data,
+        expert=expert,
     )
     first = make_plan(seed)
     check_budget(None, seed + num_seeds - 1)
@@ -442,6 +446,7 @@ def resume(
     steps: int | None = None,
     env: Any = None,
     learner: Learner | None = None,
+    expert: Any = None,
     stop_at_return: float | None = None,
     time_limit: float | None = None,
     checkpoint_every: float = 60.0,
@@ -452,7 +457,8 @@ def resume(
     """Continue a run from its last checkpoint, to its budget or to a longer one.
 
     In compiled environments the result is, bit for bit, that of the run that was never interrupted; Gymnasium's keep their own state,
-    so their episodes begin anew. Seeds that were trained together are continued together. Returns what `train` returns.
+    so their episodes begin anew. Seeds that were trained together are continued together. An expert that is a run is found again; one
+    that is code has to be given again. Returns what `train` returns.
     """
     folder = RunFolder(path)
     config = folder.config()
@@ -463,7 +469,7 @@ def resume(
         folders = siblings if all((s.path / "config.json").exists() for s in siblings) else folders
     seeds = [f.config()["seed"] for f in folders]
     limits = Limits(stop_at_return, time_limit, checkpoint_every)
-    part = from_config(config, steps=steps, env=env, learner=learner)
+    part = from_config(config, steps=steps, env=env, learner=learner, expert=expert)
     require_sinks(sinks)
     session = Session(part, folders, seeds, limits, sinks, quiet)
     common = sorted(set.intersection(*(set(f.iterations()) for f in folders)))
