@@ -155,7 +155,7 @@ ALGORITHMS: dict[str, Row] = {
                 {"unroll": 50, "updates": 200, "batch_size": 128, "warm_up": 200, "replay": {"capacity": 100_000}}
                 | loop,
                 1,
-                4,
+                2,
             )
             for name, number, summary, learner, loop in (
                 (
