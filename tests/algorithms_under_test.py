@@ -17,6 +17,7 @@ from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.planning import CrossEntropy, RandomShooting
 from rewardtogo.value.exploration import Boltzmann
 from rewardtogo.value.tabular_q import QLearning
 
@@ -114,6 +115,12 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "ddpg": lambda: continuous(rtg.DDPG(network=small, noise=rtg.OU(), normalise_observations=True)),
     "td3-lstm": lambda: continuous(rtg.TD3(network=lstm, noise=rtg.OU())),
     "sac": lambda: continuous(rtg.SAC(network=small, normalise_observations=True)),
+    "pets": lambda: continuous(
+        rtg.ModelBased(sizes=(8,), members=2, planner=CrossEntropy(samples=6, elites=2, iterations=2), horizon=3)
+    ),
+    "mbrl-ts1": lambda: off_policy(
+        rtg.ModelBased(sizes=(8,), members=2, planner=RandomShooting(samples=6), horizon=3, every=2, propagation="ts1")
+    ),
     "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
     "double-q-learning": lambda: rtg.OnPolicy(
         rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4

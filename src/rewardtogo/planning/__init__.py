@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .linear_quadratic import riccati as riccati
     from .mpc import ILQR as ILQR
     from .mpc import MPC as MPC
-    from .mpc import PLANNERS as PLANNERS
     from .mpc import Collocation as Collocation
     from .mpc import CrossEntropy as CrossEntropy
     from .mpc import GradientShooting as GradientShooting
@@ -51,7 +50,7 @@ _HOMES = {
     "sqp": "collocation",
     "cross_entropy": "cem mppi",
     "iterated_lqr": "ilqr",
-    "mpc": "MPC PLANNERS Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
+    "mpc": "MPC Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
     "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why",
