@@ -369,6 +369,16 @@ ALGORITHMS: dict[str, Row] = {
             {},
             _EVERY_STEP,
         ),
+        Row(
+            "mcts_distill",
+            "rewardtogo.imitation.bc:BC",
+            "distill",
+            "8",
+            "8.25",
+            ("discrete",),
+            "a network learns what Monte Carlo tree search would do in the states that it comes to",
+            {"network": {"class": "mlp", "sizes": [128, 128], "activation": "relu"}},
+        ),
     )
 }
 
@@ -377,6 +387,7 @@ LOOPS = {
     "off_policy": "rewardtogo.loops.off_policy:OffPolicy",
     "offline": "rewardtogo.loops.offline:Offline",
     "asynchronous": "rewardtogo.actor_critic.asynchronous:Asynchronous",
+    "distill": "rewardtogo.planning.distill:Distill",
 }
 
 ENVIRONMENTS: dict[str, str] = {
@@ -396,6 +407,10 @@ ENVIRONMENTS: dict[str, str] = {
     "TruncatedLoop": "probe: reward 1 for ever, cut after 10 steps; V = 1/(1 - gamma)",
     "RecallProbe": "probe: repeat a cue shown at the start; needs a memory",
     "Catch": "pictures of 10 x 5 pixels: catch a falling ball; the optimum is 1",
+    "TicTacToe": "tic-tac-toe against random moves, either side begins; tells which moves are allowed",
+    "TicTacToePerfect": "the same against a player without a mistake: the optimum is 0",
+    "ConnectFour": "Connect Four against random moves",
+    "ConnectFour5x5": "the same on 5 rows and 5 columns",
 }
 """Environments that are compiled with the learner. Every Gymnasium id works besides, through one door."""
 

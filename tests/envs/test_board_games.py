@@ -1,5 +1,6 @@
 """Boards of bits against boards of squares, and opponents against exhaustive search."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewardtogo.core import MASK
+from rewardtogo.core import MASK, env_spec
 from rewardtogo.envs.board_games import ConnectFour, TicTacToe, open_windows
 from rewardtogo.envs.opponents import (
     Minimax,
@@ -38,7 +39,16 @@ def random_games(game: Any, count: int) -> Any:
         _, (states, actions, rewards) = jax.lax.scan(step, first, jax.random.split(key, game.rows * game.columns))
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, states), actions, rewards
 
-    return jax.device_get(jax.jit(jax.vmap(play))(jax.random.split(KEY, count)))
+    return jax.jit(jax.vmap(play))(jax.random.split(KEY, count))
+
+
+def everywhere(function: Any, states: Any) -> Any:
+    """A function of one state, of all of them `[N, T]`."""
+    return jax.device_get(jax.jit(jax.vmap(jax.vmap(function)))(states))
+
+
+def all_equal(a: Any, b: Any) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def has_line(squares: np.ndarray, length: int) -> bool:
@@ -59,27 +69,27 @@ def test_rules_square_by_square(name):
     game = GAMES[name]
     length = game.length if isinstance(game, ConnectFour) else 3
     states, actions, rewards = random_games(game, 24)
+    look = lambda s: (game.terminal(s), game.player(s), game.legal(s), game.observe(s))  # noqa: E731
+    terminal, player, legal, seen = everywhere(look, states)
+    assert all_equal(everywhere(lambda s: game.encode(game.observe(s)), states), states)
     results = set()
     for i in range(24):
         boards = [np.zeros((game.rows, game.columns), bool) for _ in (0, 1)]
         for t in range(game.rows * game.columns):
-            state = jax.tree.map(lambda x: x[i, t], states)  # noqa: B023
             over = has_line(boards[0], length) or has_line(boards[1], length) or (boards[0] | boards[1]).all()
-            assert bool(game.terminal(state)) == over
+            assert terminal[i, t] == over
             if over:
                 break
             mover, action, taken = t % 2, int(actions[i, t]), boards[0] | boards[1]
-            assert int(game.player(state)) == mover
+            assert player[i, t] == mover
+            assert (seen["board"][i, t] == [boards[mover], boards[1 - mover]]).all()
             if isinstance(game, ConnectFour):
-                assert (np.asarray(game.legal(state)) == ~taken.all(0)).all()
+                assert (legal[i, t] == ~taken.all(0)).all()
                 square = (int(taken[:, action].sum()), action)
             else:
-                assert (np.asarray(game.legal(state)) == ~taken.ravel()).all()
+                assert (legal[i, t] == ~taken.ravel()).all()
                 square = divmod(action, 3)
-            seen = game.observe(state)
-            assert (np.asarray(seen["board"]) == [boards[mover], boards[1 - mover]]).all()
-            back = game.encode(seen)
-            assert all((a == b).all() for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(state), strict=True))
+            assert not taken[square]
             boards[mover][square] = True
             won = has_line(boards[mover], length)
             assert rewards[i, t] == (0 if not won else 1 if mover == 0 else -1)
@@ -89,58 +99,58 @@ def test_rules_square_by_square(name):
 
 def test_open_windows_square_by_square():
     game = ConnectFour()
-    states, _, _ = random_games(game, 8)
-    for i in range(8):
-        for t in (3, 9, 15):
-            state = jax.tree.map(lambda x: x[i, t], states)  # noqa: B023
-            planes = np.asarray(game.observe(state)["board"]).astype(int)
-            first = planes[0] - planes[1] if t % 2 == 0 else planes[1] - planes[0]
-            total = 0
-            for r in range(6):
-                for c in range(7):
-                    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-                        line = [(r + dr * k, c + dc * k) for k in range(4)]
-                        if all(0 <= a < 6 and 0 <= b < 7 for a, b in line):
-                            stones = [first[s] for s in line]
-                            for side in (1, -1):
-                                if -side not in stones:
-                                    total += side * {2: 1, 3: 10}.get(stones.count(side), 0)
-            if not bool(game.terminal(state)):
-                assert float(open_windows(game, state)) == pytest.approx(total / 1000)
+    states, _, _ = random_games(game, 16)
+    look = lambda s: (game.terminal(s), game.observe(s)["board"], open_windows(game, s))  # noqa: E731
+    terminal, boards, scores = everywhere(look, states)
+    compared = 0
+    for i, t in itertools.product(range(16), (3, 9, 14, 15)):
+        if terminal[i, t]:
+            continue
+        squares = (boards[i, t, 0].astype(int) - boards[i, t, 1]) * (1 if t % 2 == 0 else -1)
+        assert scores[i, t] == pytest.approx(naive_windows(squares) / 1000)
+        compared += scores[i, t] != 0
+    assert compared > 20
 
 
-def alpha_beta(game: Any, state: Any, depth: int, low: float, high: float) -> float:
-    """The value for who is to move, with cuts, one position after the other."""
-    side = 1 if int(state.plies) % 2 == 0 else -1
-    if depth == 0:
-        return side * float(open_windows(game, state))
-    best = -np.inf
-    for action in np.flatnonzero(np.asarray(game.legal(state))):
-        after = game.transition(state, jnp.asarray(action), KEY)
-        gain = side * float(game.reward(state, action, after))
-        later = 0.0 if bool(game.terminal(after)) else -alpha_beta(game, after, depth - 1, -(high - gain), -(low - gain))
-        best = max(best, gain + later)
-        low = max(low, best)
-        if low >= high:
-            break
-    return best
+def naive_windows(squares: np.ndarray) -> int:
+    total = 0
+    for r, c, (dr, dc) in itertools.product(range(6), range(7), ((0, 1), (1, 0), (1, 1), (1, -1))):
+        line = [(r + dr * k, c + dc * k) for k in range(4)]
+        if all(0 <= a < 6 and 0 <= b < 7 for a, b in line):
+            stones = [squares[s] for s in line]
+            total += sum(side * {2: 1, 3: 10}.get(stones.count(side), 0) for side in (1, -1) if -side not in stones)
+    return total
 
 
 def test_minimax_is_alpha_beta():
-    """The values of all lines side by side, against a search with cuts, on a small board."""
+    """All lines side by side, against a search with cuts, one position after the other, on a small board."""
     game = ConnectFour(4, 4, 3)
-    states, _, _ = random_games(game, 6)
-    look = jax.jit(lambda s: minimax(game, s, 3, open_windows))
-    compared = 0
-    with jax.disable_jit(False):
-        for i in range(6):
-            state = jax.tree.map(lambda x: x[i, 4], states)  # noqa: B023
-            if bool(game.terminal(state)):
-                continue
-            value = float(look(jax.tree.map(jnp.asarray, state)).max())
-            assert value == pytest.approx(alpha_beta(game, state, 3, -np.inf, np.inf), abs=1e-6)
-            compared += 1
-    assert compared >= 3
+    step = jax.jit(lambda s, a: (t := game.transition(s, a, KEY), game.reward(s, a, t), game.terminal(t), game.legal(t)))
+    judge = jax.jit(lambda s: open_windows(game, s))
+
+    def alpha_beta(state: Any, legal: Any, depth: int, low: float, high: float) -> float:
+        side = 1 if int(state.plies) % 2 == 0 else -1
+        if depth == 0:
+            return side * float(judge(state))
+        best = -np.inf
+        for action in np.flatnonzero(legal):
+            after, reward, over, free = step(state, jnp.asarray(action, jnp.int32))
+            gain = side * float(reward)
+            later = 0.0 if over else -alpha_beta(after, free, depth - 1, gain - high, gain - low)
+            best = max(best, gain + later)
+            low = max(low, best)
+            if low >= high:
+                break
+        return best
+
+    states, _, _ = random_games(game, 8)
+    values = everywhere(lambda s: minimax(game, s, 3, open_windows).max(), states)
+    terminal, legal = everywhere(lambda s: (game.terminal(s), game.legal(s)), states)
+    places = [(i, t) for i in range(8) for t in (2, 5) if not terminal[i, t]]
+    assert len(places) > 8
+    for at in places:
+        state = jax.tree.map(lambda x: x[at], states)  # noqa: B023
+        assert values[at] == pytest.approx(alpha_beta(state, legal[at], 3, -np.inf, np.inf), abs=1e-6)
 
 
 def results(env: Any, policy: Any, steps: int) -> np.ndarray:
@@ -158,15 +168,15 @@ def results(env: Any, policy: Any, steps: int) -> np.ndarray:
 def test_nobody_beats_the_perfect_player():
     game = TicTacToe()
     env = vectorize(Versus(game, PerfectOpponent()), 64)
-    found = results(env, RandomPolicy(rtg_spec(env)), 20)
+    found = results(env, RandomPolicy(env_spec(env)), 20)
     assert found.max() == 0
     assert found.min() == -1
-    # The whole tree of the game: from the start a draw.
-    state = game.start(KEY)
-    deep = minimax(game, jax.tree.map(jnp.asarray, play(game, state, [0, 4, 8])), 6)
+    # After two corners and the middle the corners lose: all lines to the end of the game say so, and so does the table.
+    state = play(game, game.start(KEY), [0, 4, 8])
+    values = np.asarray(jax.jit(lambda s: minimax(game, s, 6))(state))
     table = PerfectOpponent()
-    moves = {int(table(game, play(game, state, [0, 4, 8]), k)) for k in jax.random.split(KEY, 40)}
-    assert moves == set(np.flatnonzero(np.asarray(deep) == np.asarray(deep).max()).tolist()) == {1, 3, 5, 7}
+    moves = jax.jit(jax.vmap(lambda k: table(game, state, k)))(jax.random.split(KEY, 40))
+    assert set(moves.tolist()) == set(np.flatnonzero(values == values.max()).tolist()) == {1, 3, 5, 7}
 
 
 def play(game: Any, state: Any, moves: list[int]) -> Any:
@@ -175,15 +185,9 @@ def play(game: Any, state: Any, moves: list[int]) -> Any:
     return state
 
 
-def rtg_spec(env: Any) -> Any:
-    from rewardtogo.core import env_spec
-
-    return env_spec(env)
-
-
 def test_a_random_player_is_sometimes_beaten_and_the_mask_is_kept():
     env = vectorize(Versus(TicTacToe(), RandomOpponent()), 64)
-    found = results(env, RandomPolicy(rtg_spec(env)), 20)
+    found = results(env, RandomPolicy(env_spec(env)), 20)
     assert set(np.unique(found).tolist()) == {-1.0, 0.0, 1.0}
     # A board that is full or won allows nothing, and its mask everything.
     over = play(TicTacToe(), TicTacToe().start(KEY), [0, 3, 1, 4, 2])

@@ -154,7 +154,7 @@ def test_chance_comes_to_expectimax(item):
     errors, budgets = [], (100, 400, 1600)
     for n in budgets:
         search = TreeSearch(
-            simulations=n, guide=Rollouts(horizon=3), max_depth=3, outcomes=2, bounds=(0.0, 3.0), choose="max"
+            simulations=n, rule=UCT(0.1), guide=Rollouts(horizon=3), max_depth=3, outcomes=2, bounds=(0.0, 3.0), choose="max"
         )
         keys = jax.random.split(KEY, 64)
         found = decisions(stack(games), jnp.broadcast_to(ROOT, (64, 2)), keys, search)
