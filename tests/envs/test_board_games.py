@@ -125,7 +125,9 @@ def naive_windows(squares: np.ndarray) -> int:
 def test_minimax_is_alpha_beta():
     """All lines side by side, against a search with cuts, one position after the other, on a small board."""
     game = ConnectFour(4, 4, 3)
-    step = jax.jit(lambda s, a: (t := game.transition(s, a, KEY), game.reward(s, a, t), game.terminal(t), game.legal(t)))
+    step = jax.jit(
+        lambda s, a: (t := game.transition(s, a, KEY), game.reward(s, a, t), game.terminal(t), game.legal(t))
+    )
     judge = jax.jit(lambda s: open_windows(game, s))
 
     def alpha_beta(state: Any, legal: Any, depth: int, low: float, high: float) -> float:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_games import ROOT, Endless, TreeGame, optimal_values, random_tree, stack
 
 from rewardtogo.envs.board_games import TicTacToe
 from rewardtogo.envs.cartpole import CartPole
@@ -20,8 +21,6 @@ from rewardtogo.loops import begin, collect
 from rewardtogo.planning.guides import Guided, Rollouts, pick
 from rewardtogo.planning.tree_policies import PUCT, UCT, Edges
 from rewardtogo.planning.tree_search import Numbered, SearchPolicy, TreeSearch, mcts
-
-from small_games import ROOT, Endless, TreeGame, optimal_values, random_tree, stack
 
 KEY = jax.random.key(0)
 
@@ -154,7 +153,13 @@ def test_chance_comes_to_expectimax(item):
     errors, budgets = [], (100, 400, 1600)
     for n in budgets:
         search = TreeSearch(
-            simulations=n, rule=UCT(0.1), guide=Rollouts(horizon=3), max_depth=3, outcomes=2, bounds=(0.0, 3.0), choose="max"
+            simulations=n,
+            rule=UCT(0.1),
+            guide=Rollouts(horizon=3),
+            max_depth=3,
+            outcomes=2,
+            bounds=(0.0, 3.0),
+            choose="max",
         )
         keys = jax.random.split(KEY, 64)
         found = decisions(stack(games), jnp.broadcast_to(ROOT, (64, 2)), keys, search)

@@ -34,8 +34,8 @@ class Board(eqx.Module):
 class LineGame(Game):
     """A game that a line of stones wins: +1 for the first player, -1 for the second, 0 for a full board.
 
-    The observation shows the board to who is to move: `board` `[2, rows, columns]`, own stones and the other's, and which moves are allowed.
-    Moves that are not are no moves of the game: what follows one is undefined.
+    The observation shows the board to who is to move, `board` `[2, rows, columns]`, own stones and the other's, and which moves are
+    allowed. Others are no moves of the game: what follows one is undefined.
     """
 
     rows: eqx.AbstractVar[int]

@@ -3,6 +3,8 @@
     RandomOpponent    any allowed move
     Minimax           looks a few moves ahead and chooses the best for itself, as alpha-beta search does
     PerfectOpponent   tic-tac-toe by a table of all positions
+
+`Versus` is the environment.
 """
 
 import functools

@@ -5,8 +5,8 @@ answers so far:
 
     s ~ d^{pi_theta},   a*(s) = mcts(s),   theta <- argmin_theta  sum_{D} -log pi_theta(a* | s),   D <- D with (s, a*).
 
-The states are the student's own, so that what it learns is right where it goes, and errors do not add up along an episode (chapter 2). What it
-acts with afterwards is one pass of a network in place of hundreds of simulations.
+The states are the student's own, so that what it learns is right where it goes, and errors do not add up along an episode (chapter 2).
+What it acts with afterwards is one pass of a network in place of hundreds of simulations.
 
 Deviations: Guo et al. distil into a classifier of pictures and, at first, act by the search; here the student acts from the start, sampling
 its actions, and the answers are kept in a memory of fixed size.
@@ -59,8 +59,8 @@ class DistillState(eqx.Module):
 
 
 class Distill(Algorithm, Configured):
-    """Each iteration takes `unroll` steps of the student in each environment, asks a search by UCT in `model` about every state on the way, and
-    learns from `updates` batches of all the answers.
+    """Each iteration takes `unroll` steps of the student in each environment, asks a search by UCT in `model` about every state on the
+    way, and learns from `updates` batches of all the answers.
 
     `model` is what the environment is a view of, a game or a model with numbered actions, and its `encode` reads the environment's
     observations. Raises `ValueError` where the learner wants anything else than transitions, and for other actions than the model's.

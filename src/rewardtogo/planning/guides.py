@@ -2,6 +2,8 @@ r"""What the search believes of a state that it sees for the first time: the def
 
     Rollouts   V(s) ~ sum_t gamma^t r_t of one simulation by a random or a given policy     (notes, section 8.2.3; item 8.20)
     Guided     (p, v) = f(o), a prior over actions and a value, learned                    (Silver et al. 2018)
+
+Both count values as the first player does.
 """
 
 from abc import abstractmethod

@@ -5,11 +5,11 @@
     evaluate   by the guide: a rollout, or a network
     back up    the return is counted in every edge of the path
 
-Nodes are rows of arrays; row 0 is the root. One root, no batch axis: `vmap` gives many trees in one program. The states that nodes stand for
-are kept in the tree, so that going on from a node is rolling the simulator back to it (item 8.19).
+Nodes are rows of arrays; row 0 is the root. One root, no batch axis: `vmap` gives many trees in one program. The states that nodes
+stand for are kept in the tree, so that going on from a node is rolling the simulator back to it (item 8.19).
 
-Chance: with `outcomes` K > 1, every passage of an edge samples the next state anew, and each outcome that is seen for the first time becomes
-a child of its own, until there are K; after that, one that is not among them is replaced by one that is, as often as they came up.
+Chance: with `outcomes` K > 1, every passage of an edge samples the next state anew, and each outcome that is seen for the first time
+becomes a child of its own, until there are K; after that, one that is not among them is replaced by one that is, as often as they came up.
 The mean over an edge is then an expectation (item 8.22). With K = 1 an edge leads for ever to what it led to first.
 """
 
@@ -59,7 +59,8 @@ class Walk(eqx.Module):
     - `nodes`, `actions`: along the path, `depth` actions of it.
     - `before`: the state that the last action was taken in. Kept on the way, because where the compiler reads it from the tree once more
       after the loop, it copies all the states of all the trees in every simulation.
-    - `going`: whether it goes on; `new`: whether the last node is one that the tree does not have yet; `slot`: its place among the outcomes.
+    - `going`: whether it goes on; `new`: whether the last node is one that the tree does not have yet.
+    - `slot`: the last node's place among the outcomes of the last action.
     """
 
     nodes: Int[Array, "D1"]

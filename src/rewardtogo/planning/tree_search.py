@@ -21,9 +21,22 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core import Action, Carry, Choices, Configured, Model, Number, Observation, Policy, PRNGKey, Solution, State
-from ..core import number as _number
-from ..core import part, setting
+from ..core import (
+    Action,
+    Carry,
+    Choices,
+    Configured,
+    Model,
+    Number,
+    Observation,
+    Policy,
+    PRNGKey,
+    Solution,
+    State,
+    number,
+    part,
+    setting,
+)
 from .guides import Guide, Rollouts
 from .problem import as_module
 from .tree import Tree, back_up, descend, expand, grow, plant
@@ -36,8 +49,10 @@ class TreeSearch(Configured):
     simulations: int = setting(100, "simulations for a decision, each of which adds one node to the tree", at_least=1)
     rule: TreePolicy = part(UCT(), "how simulations go down the tree: UCT() or PUCT()")
     guide: Guide = part(Rollouts(), "what is believed of a new node: Rollouts() or Guided(network)")
-    discount: Number = _number(1.0, "gamma, along the path and in rollouts", at_least=0, at_most=1)
-    outcomes: int = setting(1, "K: next states that are told apart after one action; 1 for deterministic models", at_least=1)
+    discount: Number = number(1.0, "gamma, along the path and in rollouts", at_least=0, at_most=1)
+    outcomes: int = setting(
+        1, "K: next states that are told apart after one action; 1 for deterministic models", at_least=1
+    )
     max_depth: int = setting(0, "deepest node; 0 for as deep as the number of simulations allows", at_least=0)
     choose: Literal["robust", "max"] = setting(
         "robust", "most visits (robust) or the best mean (max)", choices=("robust", "max")
@@ -81,7 +96,7 @@ def mcts(model: Model, root: State, key: PRNGKey, search: TreeSearch | None = No
     search = TreeSearch() if search is None else search
     if not isinstance(model, Choices):
         raise ValueError(
-            f"a tree search needs numbered actions and {type(model).__name__} does not say how many there are: give it as Numbered(model, A)"
+            f"a tree search needs numbered actions, and {type(model).__name__} does not say how many: give it as Numbered(model, A)"
         )
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, root, key))):
         _check_root(model, root)

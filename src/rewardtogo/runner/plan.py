@@ -198,8 +198,8 @@ def _more(kind: str, name: str, env: VectorEnv) -> dict[str, Any]:
 def search_model(env: VectorEnv, name: str = "a tree search") -> Choices:
     """What a tree search looks ahead with: the rules of a game, or the environment itself as its own model.
 
-    Raises `ValueError`, in the name of who wants to search, for environments that no search can look ahead in: those outside of the compiled
-    program, those whose observation does not tell their state, and those whose actions are not numbered.
+    Raises `ValueError`, in the name of who wants to search, for environments that no search can look ahead in: those outside of the
+    compiled program, those whose observation does not tell their state, and those whose actions are not numbered.
     """
     if not isinstance(env, Vectorized):
         raise ValueError(
