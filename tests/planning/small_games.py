@@ -25,7 +25,7 @@ class TreeGame(Choices):
         return self.rewards.shape[0]
 
     @property
-    def num_actions(self) -> int:  # type: ignore[override]
+    def num_actions(self) -> int:
         return self.rewards.shape[2]
 
     def encode(self, observation: Any) -> Any:
@@ -84,8 +84,11 @@ def optimal_values(game: TreeGame, discount: float = 1.0) -> np.ndarray:
 class Endless(Choices):
     """Walks along the whole numbers, for ever; every step is worth 1."""
 
-    num_actions: int = eqx.field(static=True, default=2)
     allowed: bool = eqx.field(static=True, default=True)
+
+    @property
+    def num_actions(self) -> int:
+        return 2
 
     def encode(self, observation: Any) -> Any:
         return observation

@@ -98,10 +98,13 @@ class Model(eqx.Module):
 class Choices(Model):
     """A model whose actions are numbered, of one player, or of two whose gains are each other's losses.
 
-    Rewards are the first player's. A state in which nothing is allowed counts as an end, like a terminal one. `num_actions` is A.
+    Rewards are the first player's. A state in which nothing is allowed counts as an end, like a terminal one.
     """
 
-    num_actions: eqx.AbstractVar[int]
+    @property
+    @abstractmethod
+    def num_actions(self) -> int:
+        """A."""
 
     @abstractmethod
     def legal(self, state: State) -> Bool[Array, "A"]:

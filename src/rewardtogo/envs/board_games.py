@@ -106,7 +106,10 @@ class TicTacToe(LineGame):
 
     rows: int = eqx.field(default=3, init=False, static=True)
     columns: int = eqx.field(default=3, init=False, static=True)
-    num_actions: int = eqx.field(default=9, init=False, static=True)
+
+    @property
+    def num_actions(self) -> int:
+        return 9
 
     def empty(self) -> Bits:
         return jnp.zeros((), jnp.int32)
@@ -145,7 +148,7 @@ class ConnectFour(LineGame):
             raise ValueError(f"{self.length} in a row do not fit on a board of {self.rows} by {self.columns}")
 
     @property
-    def num_actions(self) -> int:  # type: ignore[override]
+    def num_actions(self) -> int:
         return self.columns
 
     def empty(self) -> Bits:

@@ -148,18 +148,22 @@ def _check_root(model: Choices, root: State) -> None:
 
 
 class Numbered(Choices):
-    """A model with `num_actions` actions, all of them always allowed, and one player.
+    """A model with `size` actions, all of them always allowed, and one player.
 
     - `view`: what a state looks like to a network; the state itself where it is left out.
     """
 
     model: Model
-    num_actions: int = eqx.field(static=True)
+    size: int = eqx.field(static=True)
     view: Callable | None = eqx.field(default=None, converter=as_module)
 
     def __check_init__(self) -> None:
-        if isinstance(self.num_actions, bool) or not isinstance(self.num_actions, int) or self.num_actions < 1:
-            raise ValueError(f"there must be at least one action to choose, and a whole number, not {self.num_actions}")
+        if isinstance(self.size, bool) or not isinstance(self.size, int) or self.size < 1:
+            raise ValueError(f"there must be at least one action to choose, and a whole number, not {self.size}")
+
+    @property
+    def num_actions(self) -> int:
+        return self.size
 
     def encode(self, observation: Observation) -> State:
         return self.model.encode(observation)
