@@ -51,7 +51,7 @@ def match(search: TreeSearch, opponent: Minimax, games: int, seed: int = 0) -> n
 @pytest.mark.slow
 def test_uct_beats_alpha_beta(item):
     search = TreeSearch(
-        simulations=2000, rule=UCT(exploration=0.5), guide=Rollouts(horizon=42), max_depth=42, bounds=(-1.0, 1.0)
+        simulations=2000, rule=UCT(exploration=0.2), guide=Rollouts(horizon=42), max_depth=42, bounds=(-1.0, 1.0)
     )
     results = match(search, Minimax(4, open_windows), 200)
     with item("8.18") as check:
