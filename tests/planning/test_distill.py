@@ -77,7 +77,9 @@ def test_the_student_plays_like_the_search(item):
 def small_loop(**options: Any) -> Distill:
     env = rtg.vectorize(Versus(TicTacToe(), RandomOpponent()), 4)
     options = {"simulations": 60, "horizon": 9, "unroll": 2, "updates": 2, "batch_size": 8} | options
-    return Distill(env, options.pop("learner", rtg.BC(network=rtg.MLP(8))), options.pop("model", TicTacToe()), **options)
+    return Distill(
+        env, options.pop("learner", rtg.BC(network=rtg.MLP(8))), options.pop("model", TicTacToe()), **options
+    )
 
 
 def test_answers_are_those_of_the_search_and_allowed():
