@@ -2,30 +2,18 @@
 
 from typing import Any
 
-import equinox as eqx
 import gymnasium.spaces as spaces
 import jax
-import jax.numpy as jnp
 
 from rewardtogo.core import EnvSpec, from_space
 from rewardtogo.envs.board_games import ConnectFour
 from rewardtogo.envs.opponents import one_of
 from rewardtogo.nn import MLP
 from rewardtogo.nn.actor_critic import ActorCritic
+from rewardtogo.planning.self_play import PolicyValue
 
 ROOTS, SIMULATIONS, PLIES = 64, 64, 6
 GAME = ConnectFour()
-
-
-class PolicyValue(eqx.Module):
-    """Logits and a value for who is to move, from one torso."""
-
-    network: ActorCritic
-
-    def __call__(self, observation: Any) -> tuple[jax.Array, jax.Array]:
-        carry, distribution = self.network.act(self.network.init()[0], observation)
-        del carry
-        return distribution.logits, jnp.tanh(self.network.value(self.network.init(), observation))  # type: ignore[attr-defined]
 
 
 def network(key: jax.Array) -> PolicyValue:

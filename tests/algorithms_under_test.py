@@ -19,7 +19,7 @@ from rewardtogo.envs.opponents import RandomOpponent, Versus
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
-from rewardtogo.planning import Distill
+from rewardtogo.planning import AlphaZero, Distill, SelfPlay
 from rewardtogo.value.exploration import Boltzmann
 from rewardtogo.value.tabular_q import QLearning
 
@@ -129,6 +129,16 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
         simulations=4,
         horizon=9,
         unroll=2,
+        updates=2,
+        batch_size=8,
+    ),
+    "alphazero": lambda: SelfPlay(
+        rtg.vectorize(Versus(TicTacToe(), RandomOpponent()), NUM_ENVS),
+        AlphaZero(network=small),
+        TicTacToe(),
+        rtg.UniformReplay(64),
+        simulations=4,
+        max_plies=6,
         updates=2,
         batch_size=8,
     ),

@@ -379,6 +379,15 @@ ALGORITHMS: dict[str, Row] = {
             "a network learns what Monte Carlo tree search would do in the states that it comes to",
             {"network": {"class": "mlp", "sizes": [128, 128], "activation": "relu"}},
         ),
+        Row(
+            "alphazero",
+            "rewardtogo.planning.self_play:AlphaZero",
+            "self_play",
+            "8",
+            "8.25",
+            ("discrete",),
+            "games against itself: a network guides a search, and learns from what the search made of it",
+        ),
     )
 }
 
@@ -388,6 +397,7 @@ LOOPS = {
     "offline": "rewardtogo.loops.offline:Offline",
     "asynchronous": "rewardtogo.actor_critic.asynchronous:Asynchronous",
     "distill": "rewardtogo.planning.distill:Distill",
+    "self_play": "rewardtogo.planning.self_play:SelfPlay",
 }
 
 ENVIRONMENTS: dict[str, str] = {

@@ -1,5 +1,6 @@
 """Distillation of a search into a network (item 8.25), what it refuses, and the command."""
 
+import dataclasses
 import json
 import time
 from typing import Any
@@ -14,12 +15,12 @@ from rewardtogo.cli.main import main
 from rewardtogo.core import MASK
 from rewardtogo.data.noise import EXPERT
 from rewardtogo.envs.board_games import ConnectFour, TicTacToe
-from rewardtogo.envs.known import KnownModel
-from rewardtogo.envs.opponents import RandomOpponent, Versus
-from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.known import KnownModel
+from rewardtogo.envs.opponents import PerfectOpponent, RandomOpponent, Versus
+from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import begin, collect
-from rewardtogo.planning import Distill, Numbered, SearchPolicy
+from rewardtogo.planning import AlphaZero, Distill, Numbered, SearchPolicy, SelfPlay
 from rewardtogo.runner.plan import search_model
 
 KEY = jax.random.key(0)
@@ -122,6 +123,60 @@ def test_an_environment_is_its_own_model():
     assert isinstance(model.model, KnownModel)
     assert model.num_actions == 2
     assert isinstance(search_model(rtg.make("TicTacToe")), TicTacToe)
+
+
+def self_play(**options: Any) -> SelfPlay:
+    env = rtg.vectorize(Versus(TicTacToe(), RandomOpponent()), 8)
+    learner, model = options.pop("learner", AlphaZero(network=rtg.MLP(16))), options.pop("model", TicTacToe())
+    return SelfPlay(env, learner, model, **{"simulations": 8, "max_plies": 9, "updates": 2, "batch_size": 16} | options)
+
+
+def test_games_against_itself_teach_how_they_went_on():
+    loop = self_play(discount=0.5)
+    state = jax.jit(loop.init)(KEY)
+    games, episodes = jax.device_get(jax.jit(loop.play)(state.learner, KEY))
+    played, outcome = games.extras["played"], games.extras["outcome"]
+    boards = games.observation["board"]
+    assert (boards.sum((2, 3, 4)) == np.arange(9)[:, None])[played > 0].all()  # one stone more in every ply
+    assert float(episodes.length_sum) == played.sum()
+    np.testing.assert_allclose(games.extras["visits"][played > 0].sum(-1), 1, atol=1e-6)
+    assert (games.extras["visits"] * (1 - games.observation[MASK]) == 0)[played > 0].all()
+    for b in range(8):
+        last = int(played[:, b].sum()) - 1
+        gain = games.reward[last, b]  # the first player's; whoever moved last has won, or it is a draw
+        for t in range(last + 1):
+            side = 1 if t % 2 == 0 else -1
+            assert outcome[t, b] == pytest.approx(side * gain * 0.5 ** (last - t))
+    first, _ = jax.jit(loop.step)(state, KEY)
+    _, (metrics, _) = jax.jit(loop.step)(first, jax.random.key(1))
+    assert all(np.isfinite(value) for value in jax.tree.leaves(metrics))
+    with pytest.raises(ValueError, match="teaches AlphaZero"):
+        self_play(learner=rtg.BC(network=rtg.MLP(4)))
+    with pytest.raises(ValueError, match="needs a game"):
+        self_play(model=Numbered(KnownModel(CartPole()), 9))
+    with pytest.raises(ValueError, match="has 7 moves"):
+        self_play(model=ConnectFour())
+
+
+@pytest.mark.slow
+def test_alphazero_learns_tic_tac_toe(item):
+    """After 200 rounds of 32 games the network with 50 simulations loses no more than 2 of 200 games against a perfect player."""
+    game = TicTacToe()
+    env = rtg.vectorize(Versus(game, RandomOpponent()), 32)
+    loop = SelfPlay(env, AlphaZero(), game, simulations=32, max_plies=9, opening=4, updates=32)
+    train = jax.jit(
+        lambda s, k: jax.lax.scan(lambda s, k: loop.step(s, k), s, jax.random.split(k, 50))[0], compiler_options=FAST
+    )
+    state = jax.jit(loop.init)(KEY)
+    for i in range(4):
+        state = train(state, jax.random.fold_in(KEY, i))
+    arena = rtg.vectorize(Versus(game, PerfectOpponent()), 200)
+    quiet = dataclasses.replace(loop, noise=0.0, simulations=50)
+    policy = SearchPolicy(game, quiet.search(state.learner))
+    returns, ended = jax.device_get(jax.jit(lambda k: played(arena, policy, k, 5), compiler_options=FAST)(KEY))
+    assert ended.all()
+    with item("8.25") as check:
+        check((returns < 0).mean(), "<=", 0.01, "games lost of 200 against a perfect player, AlphaZero, 50 simulations")
 
 
 @pytest.mark.slow

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from .problem import total_cost as total_cost
     from .problem import why as why
     from .problem import with_horizon as with_horizon
+    from .self_play import AlphaZero as AlphaZero
+    from .self_play import SelfPlay as SelfPlay
     from .tree import Tree as Tree
     from .tree_policies import PUCT as PUCT
     from .tree_policies import UCT as UCT
@@ -37,6 +39,7 @@ _HOMES = {
     "distill": "Distill",
     "guides": "Belief Guide Guided Rollouts",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why with_horizon",
+    "self_play": "AlphaZero SelfPlay",
     "tree": "Tree",
     "tree_policies": "Edges PUCT TreePolicy UCT",
     "tree_search": "Decision Numbered SearchPolicy TreeSearch mcts",

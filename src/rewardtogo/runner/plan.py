@@ -192,7 +192,7 @@ def from_config(config: dict[str, Any], *, steps: int | None, env: Any = None, l
 
 def _more(kind: str, name: str, env: VectorEnv) -> dict[str, Any]:
     """What a loop is given besides environment and learner."""
-    return {"model": search_model(env, name)} if kind == "distill" else {}
+    return {"model": search_model(env, name)} if kind in ("distill", "self_play") else {}
 
 
 def search_model(env: VectorEnv, name: str = "a tree search") -> Choices:
