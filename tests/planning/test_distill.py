@@ -147,9 +147,6 @@ def test_games_against_itself_teach_how_they_went_on():
         for t in range(last + 1):
             side = 1 if t % 2 == 0 else -1
             assert outcome[t, b] == pytest.approx(side * gain * 0.5 ** (last - t))
-    first, _ = jax.jit(loop.step)(state, KEY)
-    _, (metrics, _) = jax.jit(loop.step)(first, jax.random.key(1))
-    assert all(np.isfinite(value) for value in jax.tree.leaves(metrics))
     with pytest.raises(ValueError, match="teaches AlphaZero"):
         self_play(learner=rtg.BC(network=rtg.MLP(4)))
     with pytest.raises(ValueError, match="needs a game"):

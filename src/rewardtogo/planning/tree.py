@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from ..core import Choices, PRNGKey, State
 from .guides import Guide, is_over, sign
-from .tree_policies import Edges, TreePolicy
+from .tree_policies import Bounds, Edges, TreePolicy
 
 
 class Tree(eqx.Module):
@@ -106,7 +106,7 @@ def grow(
     return tree, jnp.where(over, 0.0, belief.value)
 
 
-def edges_of(tree: Tree, node: Int[Array, ""], bounds: tuple[float, float] | None) -> Edges:
+def edges_of(tree: Tree, node: Int[Array, ""], bounds: Bounds) -> Edges:
     """What is known of the actions in a node. Returns are scaled by the bounds given, or else by the extremes so far."""
     counts = tree.counts[node]
     mean = tree.totals[node] / jnp.maximum(counts, 1.0)
@@ -120,7 +120,7 @@ def descend(
     model: Choices,
     tree: Tree,
     rule: TreePolicy,
-    bounds: tuple[float, float] | None,
+    bounds: Bounds,
     max_depth: int,
     key: PRNGKey,
 ) -> Walk:

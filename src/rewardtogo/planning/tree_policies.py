@@ -18,6 +18,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..core import Configured, Number, PRNGKey, number
 
+Bounds = tuple[Number, Number] | None
+"""The least and the greatest return, or None for the extremes met so far."""
+
 
 class Edges(eqx.Module):
     """What is known of the actions in one node.

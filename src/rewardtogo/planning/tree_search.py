@@ -40,7 +40,7 @@ from ..core import (
 from .guides import Guide, Rollouts
 from .problem import as_module
 from .tree import Tree, back_up, descend, expand, grow, plant
-from .tree_policies import UCT, TreePolicy
+from .tree_policies import UCT, Bounds, TreePolicy
 
 
 class TreeSearch(Configured):
@@ -57,7 +57,7 @@ class TreeSearch(Configured):
     choose: Literal["robust", "max"] = setting(
         "robust", "most visits (robust) or the best mean (max)", choices=("robust", "max")
     )
-    bounds: tuple[float, float] | None = eqx.field(default=None)
+    bounds: Bounds = eqx.field(default=None)
     """Least and greatest return, which the tree policy sees as 0 and 1; the extremes met so far where left out (erratum E8.9)."""
 
     def __check_init__(self) -> None:
@@ -113,7 +113,7 @@ def mcts(model: Model, root: State, key: PRNGKey, search: TreeSearch | None = No
     return Solution(decision, ~tree.over[0], {"nodes": tree.size, "cut": tree.cut})
 
 
-@eqx.filter_jit
+@jax.jit
 def _search(model: Choices, root: State, key: PRNGKey, search: TreeSearch) -> Tree:
     begin_key, noise_key, loop_key = jax.random.split(key, 3)
     root = jax.tree.map(jnp.asarray, root)
