@@ -161,7 +161,7 @@ def known_options() -> set[str]:
         *OPTIONS.values(),
         {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY", "--env.normalise-reward"},
     )
-    found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD"}
+    found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD", "--planner.FIELD"}
     classes = [("learner", class_of(name)) for name in ALGORITHMS] + [
         ("loop", resolve(path)) for path in LOOPS.values()
     ]
