@@ -225,6 +225,6 @@ def test_particles_and_their_members(item):
 def test_refusals():
     with pytest.raises(ValueError, match="cannot be followed for 20"):
         ModelBased(horizon=5, every=20)
-    with pytest.raises(ValueError, match="one of plan, random"):
-        ModelBased(acting="both")
+    with pytest.raises(ValueError, match="holdout"):
+        ModelBased(holdout=1.0)
     assert ModelBased(planner=CrossEntropy(samples=10, elites=2)).planner.samples == 10

@@ -118,7 +118,7 @@ class ModelBased(Learner):
 
     @property
     def action_kinds(self) -> tuple[str, ...]:
-        return ("box", "discrete", "multi_discrete")
+        return ("discrete", "multi_discrete", "box")
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> ModelBasedState:
         states, actions = flat_size(spec.observation), encode_action(spec.action, spec.action.zeros()).size
