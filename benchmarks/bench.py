@@ -37,6 +37,7 @@ PEERS = {
     "rejax": "rejax",
     "quantecon": "quantecon",
     "mdptoolbox": "pymdptoolbox",
+    "mctx": "mctx",
 }
 NOT_MEASURED = "not measured"
 ZOO = (
@@ -460,6 +461,20 @@ def planning(size: "Size") -> list[Row]:
     return rows
 
 
+def mcts(size: "Size") -> list[Row]:
+    """Tree search with a network, beside mctx: the same rules, network and positions."""
+    script = str(HERE / "peers" / "run_mctx.py")
+    command = lambda: [str(peer_python("mctx")), script, "--repeats", str(size.laps)]  # noqa: E731
+    found = measure({"ours": ours("mcts", "--repeats", size.laps), "mctx": Contender(command, "mctx")}, size.repeats)
+    mine, other = found["ours"], found["mctx"]
+    failed = "error" in mine or "error" in other
+    ratio = None if failed else other["seconds"] / mine["seconds"]
+    what = "tree search with PUCT, Connect Four, 64 roots, 64 simulations, 128x128 ReLU, a decision for all roots"
+    cell = lambda result: result.get("error") or f"{1e3 * result['seconds']:.1f} ms"  # noqa: E731
+    met = None if "error" in other else ratio is not None and ratio >= 1
+    return [Row(what, cell(mine), f"{peer_name('mctx')}: {cell(other)}", ratio, "≥ 1 x", met)]
+
+
 GROUPS = {
     "ppo": ppo,
     "dqn": dqn,
@@ -474,6 +489,7 @@ GROUPS = {
     "start": start,
     "memory": memory,
     "planning": planning,
+    "mcts": mcts,
 }
 
 

@@ -294,10 +294,39 @@ def dp(given: argparse.Namespace) -> dict[str, Any]:
     return {**found, "value": float(solution.value.values.mean())}
 
 
+def mcts(given: argparse.Namespace) -> dict[str, Any]:
+    """Seconds of a search by PUCT in the positions of `search_task.py`, all of them in one program."""
+    import search_task as task
+
+    from rewardtogo.planning import PUCT, Guided, TreeSearch, mcts
+
+    key = jax.random.key(0)
+    search = TreeSearch(
+        simulations=task.SIMULATIONS, rule=PUCT(noise=0.25), guide=Guided(task.network(key)), bounds=(-1.0, 1.0)
+    )
+
+    @jax.jit
+    def decide(states: Any, key: jax.Array) -> Any:
+        def one(state: Any, key: jax.Array) -> Any:
+            found = mcts(task.GAME, state, key, search).value
+            return found.action, found.probabilities
+
+        return jax.vmap(one)(states, jax.random.split(key, task.ROOTS))
+
+    states, times = task.roots(key), []
+    jax.block_until_ready(decide(states, key))
+    for i in range(given.repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(decide(states, jax.random.key(i)))
+        times.append(time.perf_counter() - began)
+    return {"seconds": statistics.median(times)}
+
+
 TASKS = {
     "train": train,
     "dots": dots,
     "dp": dp,
+    "mcts": mcts,
     "seeds": seeds,
     "door": door,
     "start": start,

@@ -13,10 +13,13 @@ from jax.flatten_util import ravel_pytree
 import rewardtogo as rtg
 from rewardtogo.core import MASK, Algorithm, Environment, Timestep, Transition, env_spec
 from rewardtogo.data import Dataset
+from rewardtogo.envs.board_games import TicTacToe
 from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.opponents import RandomOpponent, Versus
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.planning import AlphaZero, CrossEntropy, Distill, RandomShooting, SelfPlay
 from rewardtogo.value.exploration import Boltzmann
 from rewardtogo.value.tabular_q import QLearning
 
@@ -114,9 +117,36 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "ddpg": lambda: continuous(rtg.DDPG(network=small, noise=rtg.OU(), normalise_observations=True)),
     "td3-lstm": lambda: continuous(rtg.TD3(network=lstm, noise=rtg.OU())),
     "sac": lambda: continuous(rtg.SAC(network=small, normalise_observations=True)),
+    "pets": lambda: continuous(
+        rtg.ModelBased(sizes=(8,), members=2, planner=CrossEntropy(samples=6, elites=2, iterations=2), horizon=3)
+    ),
+    "mbrl-ts1": lambda: off_policy(
+        rtg.ModelBased(sizes=(8,), members=2, planner=RandomShooting(samples=6), horizon=3, every=2, propagation="ts1")
+    ),
     "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
     "double-q-learning": lambda: rtg.OnPolicy(
         rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4
+    ),
+    "mcts-distill": lambda: Distill(
+        rtg.vectorize(Versus(TicTacToe(), RandomOpponent()), NUM_ENVS),
+        rtg.BC(network=small, normalise_observations=True),
+        TicTacToe(),
+        rtg.UniformReplay(64),
+        simulations=4,
+        horizon=9,
+        unroll=2,
+        updates=2,
+        batch_size=8,
+    ),
+    "alphazero": lambda: SelfPlay(
+        rtg.vectorize(Versus(TicTacToe(), RandomOpponent()), NUM_ENVS),
+        AlphaZero(network=small),
+        TicTacToe(),
+        rtg.UniformReplay(64),
+        simulations=4,
+        max_plies=6,
+        updates=2,
+        batch_size=8,
     ),
     "bc": lambda: offline(rtg.BC(network=small, normalise_observations=True)),
     "bc-gru": lambda: offline(rtg.BC(network=gru)),

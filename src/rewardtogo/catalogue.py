@@ -175,7 +175,7 @@ ALGORITHMS: dict[str, Row] = {
                 {"unroll": 50, "updates": 200, "batch_size": 128, "warm_up": 200, "replay": {"capacity": 100_000}}
                 | loop,
                 1,
-                4,
+                2,
             )
             for name, number, summary, learner, loop in (
                 (
@@ -438,6 +438,25 @@ ALGORITHMS: dict[str, Row] = {
             {},
             _EVERY_STEP,
         ),
+        Row(
+            "mcts_distill",
+            "rewardtogo.imitation.bc:BC",
+            "distill",
+            "8",
+            "8.25",
+            ("discrete",),
+            "a network learns what Monte Carlo tree search would do in the states that it comes to",
+            {"network": {"class": "mlp", "sizes": [128, 128], "activation": "relu"}},
+        ),
+        Row(
+            "alphazero",
+            "rewardtogo.planning.self_play:AlphaZero",
+            "self_play",
+            "8",
+            "8.25",
+            ("discrete",),
+            "games against itself: a network guides a search, and learns from what the search made of it",
+        ),
     )
 }
 
@@ -447,6 +466,8 @@ LOOPS = {
     "offline": "rewardtogo.loops.offline:Offline",
     "dagger": "rewardtogo.imitation.dagger:DAgger",
     "asynchronous": "rewardtogo.actor_critic.asynchronous:Asynchronous",
+    "distill": "rewardtogo.planning.distill:Distill",
+    "self_play": "rewardtogo.planning.self_play:SelfPlay",
 }
 
 ENVIRONMENTS: dict[str, str] = {
@@ -466,6 +487,10 @@ ENVIRONMENTS: dict[str, str] = {
     "TruncatedLoop": "probe: reward 1 for ever, cut after 10 steps; V = 1/(1 - gamma)",
     "RecallProbe": "probe: repeat a cue shown at the start; needs a memory",
     "Catch": "pictures of 10 x 5 pixels: catch a falling ball; the optimum is 1",
+    "TicTacToe": "tic-tac-toe against random moves, either side begins; tells which moves are allowed",
+    "TicTacToePerfect": "the same against a player without a mistake: the optimum is 0",
+    "ConnectFour": "Connect Four against random moves",
+    "ConnectFour5x5": "the same on 5 rows and 5 columns",
 }
 """Environments that are compiled with the learner. Every Gymnasium id works besides, through one door."""
 

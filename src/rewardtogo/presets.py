@@ -217,6 +217,35 @@ PRESETS: dict[tuple[str, str], Preset] = {
     ("ddpg", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
     ("td3", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
     ("sac", "HalfCheetah-v5"): {"steps": 1_000_000, "num_envs": 1, "loop": {"warm_up": 10_000}},
+    # RL Zoo's, rewards normalised: without that one seed of two stayed at 1,500.
+    ("trpo", "Hopper-v5"): {
+        "steps": 1_000_000,
+        "num_envs": 2,
+        "env": {"normalise_reward": 0.99},
+        "loop": {"unroll": 1024},
+        "learner": {
+            "target_kl": 0.04,
+            "cg_iterations": 25,
+            "value_epochs": 20,
+            "minibatches": 16,
+            "normalise_observations": True,
+        },
+    },
+    # Tianshou's step: 0.1 times the natural gradient. Steps of a fixed divergence of 0.1 stayed at 1,600.
+    ("npg", "HalfCheetah-v5"): {
+        "steps": 1_000_000,
+        "num_envs": 16,
+        "env": {"normalise_reward": 0.99},
+        "loop": {"unroll": 64},
+        "learner": {
+            "step_by": "rate",
+            "learning_rate": 0.1,
+            "value_epochs": 20,
+            "minibatches": 1,
+            "log_std": -0.5,
+            "normalise_observations": True,
+        },
+    },
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,
@@ -232,11 +261,25 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "learner": {"gamma": 0.9, "kl_step": 0.02, "value_epochs": 20},
     },
     ("offpolicy_pg", "CartPole-v1"): {"steps": 200_000},
+    # A hundred iterations of 40,000 steps, as in the course.
+    ("vpg", "LunarLanderContinuous-v3"): {
+        "steps": 4_000_000,
+        "num_envs": 16,
+        "loop": {"unroll": 2500},
+        "learner": {"learning_rate": "linear:0.005:0", "value_learning_rate": 0.005, "value_updates": 40},
+    },
     ("vpg", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("batch_ac", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("online_ac", "CartPole-v1"): {"steps": 300_000},
     ("a2c", "CartPole-v1"): {"steps": 300_000},
     ("async_ac", "CartPole-v1"): {"steps": 300_000},
+    # A hundred iterations of 5,000 steps.
+    ("reinforce", "InvertedPendulum-v5"): {
+        "steps": 500_000,
+        "num_envs": 5,
+        "loop": {"unroll": 1000},
+        "learner": {"gamma": 0.95, "learning_rate": 0.01, "log_std": -1.0, "normalise_observations": True},
+    },
     ("reinforce", "CartPole-v1"): {"steps": 300_000, "num_envs": 8, "loop": {"unroll": 128}},
 }
 """Keys are the algorithm's name and the environment's id, or `NAMESPACE/*` for all of a namespace that have none of their own."""

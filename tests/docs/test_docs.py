@@ -20,7 +20,9 @@ from rewardtogo.catalogue import ALGORITHMS, LOOPS, Row
 from rewardtogo.cli.main import _nested, _parsers
 from rewardtogo.core import Transition, env_spec
 from rewardtogo.data.episodes import Dataset
+from rewardtogo.planning import Distill, SelfPlay
 from rewardtogo.runner.config import PARTS, build, merge, options, resolve
+from rewardtogo.runner.plan import search_model
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -159,7 +161,7 @@ def known_options() -> set[str]:
         *OPTIONS.values(),
         {"--version", "--learner.NAME", "--loop.NAME", "--env.NAME", "--env.KEY", "--env.normalise-reward"},
     )
-    found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD"}
+    found |= {"--learner.FIELD", "--loop.FIELD", "--learner.network.FIELD", "--planner.FIELD"}
     classes = [("learner", class_of(name)) for name in ALGORITHMS] + [
         ("loop", resolve(path)) for path in LOOPS.values()
     ]
@@ -210,6 +212,11 @@ def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
         return rtg.Asynchronous(env, learner, workers=2, unroll=4)
     if row.loop == "off_policy":
         return rtg.OffPolicy(env, learner, rtg.UniformReplay(64), unroll=2, warm_up=8, batch_size=4)
+    if row.loop == "distill":
+        return Distill(env, learner, search_model(env), simulations=2, unroll=1, updates=1, batch_size=2)
+    if row.loop == "self_play":
+        env = rtg.make("TicTacToe", 2)
+        return SelfPlay(env, learner, search_model(env), simulations=2, max_plies=2, updates=1, batch_size=2)
     spec, steps = env_spec(env), jnp.arange(4)
     element = lambda s: jax.tree.map(lambda x: jnp.broadcast_to(x, (4, *x.shape)), s.zeros())  # noqa: E731
     observation, never = element(spec.observation), jnp.zeros(4, bool)

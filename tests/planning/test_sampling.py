@@ -13,7 +13,6 @@ from rewardtogo.core import Spec, env_spec
 from rewardtogo.envs import MDP, CartPole, KnownModel, Pendulum, TabularModel
 from rewardtogo.planning import (
     MPC,
-    PLANNERS,
     CrossEntropy,
     FunctionProblem,
     LQProblem,
@@ -29,6 +28,7 @@ from rewardtogo.planning import (
     total_cost,
     why,
 )
+from rewardtogo.planning.mpc import PLANNERS
 from rewardtogo.planning.shooting import mean_costs
 from rewardtogo.value import backward_induction
 

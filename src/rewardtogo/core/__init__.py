@@ -8,7 +8,9 @@ from .fields import number as number
 from .fields import part as part
 from .fields import setting as setting
 from .protocols import Algorithm as Algorithm
+from .protocols import Choices as Choices
 from .protocols import Environment as Environment
+from .protocols import Game as Game
 from .protocols import Learner as Learner
 from .protocols import Model as Model
 from .protocols import Observed as Observed

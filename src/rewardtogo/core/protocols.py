@@ -11,7 +11,7 @@ import equinox as eqx
 import gymnasium.spaces as spaces
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from .fields import Configured
 from .spec import EnvSpec, from_space
@@ -93,6 +93,43 @@ class Model(eqx.Module):
     @abstractmethod
     def terminal(self, state: State) -> Bool[Array, ""]:
         """Whether a state ends the episode."""
+
+
+class Choices(Model):
+    """A model whose actions are numbered, of one player, or of two whose gains are each other's losses.
+
+    Rewards are the first player's. A state in which nothing is allowed counts as an end, like a terminal one.
+    """
+
+    @property
+    @abstractmethod
+    def num_actions(self) -> int:
+        """A."""
+
+    @abstractmethod
+    def legal(self, state: State) -> Bool[Array, "A"]:
+        """Which actions are allowed."""
+
+    @abstractmethod
+    def player(self, state: State) -> Int[Array, ""]:
+        """Who is to move: 0 the first player, 1 the second."""
+
+    @abstractmethod
+    def observe(self, state: State) -> Observation:
+        """What a state looks like to the player who is to move: what `encode` reads, and what a network looks at."""
+
+
+class Game(Choices):
+    """A model that knows how it starts, so that it can be played."""
+
+    @property
+    @abstractmethod
+    def observation_space(self) -> spaces.Space:
+        """What `observe` gives."""
+
+    @abstractmethod
+    def start(self, key: PRNGKey) -> State:
+        """The state before the first move."""
 
 
 class Policy(eqx.Module):

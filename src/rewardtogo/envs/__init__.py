@@ -1,6 +1,8 @@
 """Environments: compiled twins of Gymnasium's, tabular problems, probes, wrappers, and the door to every other one."""
 
 from .acrobot import Acrobot as Acrobot
+from .board_games import ConnectFour as ConnectFour
+from .board_games import TicTacToe as TicTacToe
 from .cartpole import CartPole as CartPole
 from .catch import Catch as Catch
 from .check import check_env as check_env
@@ -12,6 +14,11 @@ from .known import KnownModel as KnownModel
 from .known import Simulation as Simulation
 from .mountain_car import MountainCar as MountainCar
 from .mountain_car import MountainCarContinuous as MountainCarContinuous
+from .opponents import Minimax as Minimax
+from .opponents import Opponent as Opponent
+from .opponents import PerfectOpponent as PerfectOpponent
+from .opponents import RandomOpponent as RandomOpponent
+from .opponents import Versus as Versus
 from .pendulum import Pendulum as Pendulum
 from .registry import make as make
 from .reward_wrappers import NormalizeReward as NormalizeReward

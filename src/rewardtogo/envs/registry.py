@@ -9,11 +9,13 @@ from ..catalogue import ENVIRONMENTS, nearest
 from ..core import Environment, VectorEnv
 from .acrobot import Acrobot
 from .atari import PREFIX, RAW_REWARD, Atari
+from .board_games import ConnectFour, TicTacToe
 from .cartpole import CartPole
 from .catch import Catch
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
+from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
@@ -34,6 +36,10 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
     "Catch": Catch,
+    "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
+    "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
+    "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),
+    "ConnectFour5x5": lambda: Versus(ConnectFour(5, 5), RandomOpponent()),
     "OneStep": OneStep,
     "TruncatedLoop": TruncatedLoop,
     "RecallProbe": RecallProbe,

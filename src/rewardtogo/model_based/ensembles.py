@@ -149,7 +149,7 @@ class LearnedModel(Model):
 
     def predict(self, states: Float[Array, "E N O"], actions: Float[Array, "E N A"]) -> Prediction:
         """The members' words on states and encoded actions of their own."""
-        return self.ensemble(self.inputs(jnp.concatenate([states, actions], -1)))
+        return self.ensemble(jax.vmap(jax.vmap(self.inputs))(jnp.concatenate([states, actions], -1)))
 
     def transition(self, state: Belief, action: Action, key: PRNGKey) -> Belief:
         noise_key, order_key = jax.random.split(key)
@@ -159,7 +159,7 @@ class LearnedModel(Model):
         y = said.mean
         if self.propagation != "mean":
             y = y + jnp.exp(0.5 * said.log_variance) * jax.random.normal(noise_key, y.shape)
-        y = self.targets.mean[""] + self.targets.sd() * y
+        y = self.targets.mean[""][None, None] + self.targets.sd()[None, None] * y
         rewards = alive * y[..., -1]
         by_member = rewards.mean(1)
         reward = rewards.mean() - self.risk * by_member.std()

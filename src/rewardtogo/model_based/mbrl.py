@@ -118,7 +118,7 @@ class ModelBased(Learner):
 
     @property
     def action_kinds(self) -> tuple[str, ...]:
-        return ("box", "discrete", "multi_discrete")
+        return ("discrete", "multi_discrete", "box")
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> ModelBasedState:
         states, actions = flat_size(spec.observation), encode_action(spec.action, spec.action.zeros()).size
@@ -163,8 +163,8 @@ class ModelBased(Learner):
         x = jnp.concatenate([before, jax.vmap(lambda a: encode_action(spec.action, a))(t.action)], 1)
         y = jnp.concatenate([after - before, t.reward[:, None]], 1)
         inputs, targets = state.inputs.update(x), state.targets.update(y)
-        z = jnp.broadcast_to(inputs(x)[None], (self.members, *x.shape))
-        wanted, ended = targets(y), t.terminated.astype(jnp.float32)
+        z = jnp.broadcast_to(jax.vmap(inputs)(x)[None], (self.members, *x.shape))
+        wanted, ended = jax.vmap(targets)(y), t.terminated.astype(jnp.float32)
         kept = is_held_out(batch.indices, now.holdout)
         own = bootstrap_weights(batch.indices, self.members) if self.bootstrap else jnp.ones((self.members, len(y)))
         weights = jnp.where(kept[None], 0.0, own)

@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .cross_entropy import cem as cem
     from .cross_entropy import mppi as mppi
+    from .distill import Distill as Distill
+    from .guides import Belief as Belief
+    from .guides import Guide as Guide
+    from .guides import Guided as Guided
+    from .guides import Rollouts as Rollouts
     from .identification import identify as identify
     from .iterated_lqr import ilqr as ilqr
     from .linear_quadratic import LinearController as LinearController
@@ -19,7 +24,6 @@ if TYPE_CHECKING:
     from .linear_quadratic import riccati as riccati
     from .mpc import ILQR as ILQR
     from .mpc import MPC as MPC
-    from .mpc import PLANNERS as PLANNERS
     from .mpc import Collocation as Collocation
     from .mpc import CrossEntropy as CrossEntropy
     from .mpc import GradientShooting as GradientShooting
@@ -39,22 +43,40 @@ if TYPE_CHECKING:
     from .problem import rollout as rollout
     from .problem import total_cost as total_cost
     from .problem import why as why
+    from .self_play import AlphaZero as AlphaZero
+    from .self_play import SelfPlay as SelfPlay
     from .shooting import gradient_shooting as gradient_shooting
     from .shooting import newton_shooting as newton_shooting
     from .shooting import random_shooting as random_shooting
     from .shooting import shooting_hessian as shooting_hessian
     from .sqp import collocation as collocation
+    from .tree import Tree as Tree
+    from .tree_policies import PUCT as PUCT
+    from .tree_policies import UCT as UCT
+    from .tree_policies import Edges as Edges
+    from .tree_policies import TreePolicy as TreePolicy
+    from .tree_search import Decision as Decision
+    from .tree_search import Numbered as Numbered
+    from .tree_search import SearchPolicy as SearchPolicy
+    from .tree_search import TreeSearch as TreeSearch
+    from .tree_search import mcts as mcts
 
 _HOMES = {
-    "identification": "identify",
-    "open_loop": "best_open_loop open_loop_return open_loop_returns",
-    "sqp": "collocation",
     "cross_entropy": "cem mppi",
+    "distill": "Distill",
+    "guides": "Belief Guide Guided Rollouts",
+    "identification": "identify",
     "iterated_lqr": "ilqr",
-    "mpc": "MPC PLANNERS Collocation CrossEntropy GradientShooting ILQR NewtonShooting PathIntegral Planner RandomShooting",
-    "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
+    "mpc": "Collocation CrossEntropy GradientShooting ILQR MPC NewtonShooting PathIntegral Planner RandomShooting",
+    "open_loop": "best_open_loop open_loop_return open_loop_returns",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why",
+    "self_play": "AlphaZero SelfPlay",
+    "shooting": "gradient_shooting newton_shooting random_shooting shooting_hessian",
+    "sqp": "collocation",
+    "tree": "Tree",
+    "tree_policies": "Edges PUCT TreePolicy UCT",
+    "tree_search": "Decision Numbered SearchPolicy TreeSearch mcts",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
 

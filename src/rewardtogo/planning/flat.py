@@ -154,8 +154,8 @@ def check_dynamics(problem: Problem, state: State) -> None:
     shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree)  # noqa: E731
     if jax.tree.structure(following) != jax.tree.structure(state) or shapes(following) != shapes(state):
         raise ValueError(f"the dynamics lead from a state of shape {shapes(state)} to one of shape {shapes(following)}")
-    if getattr(cost, "shape", None) != ():
-        raise ValueError(f"the cost of a step must be one number, not an array of shape {getattr(cost, 'shape', '?')}")
+    if shapes(cost) != ():
+        raise ValueError(f"the cost of a step must be one number, not an array of shape {shapes(cost)}")
 
 
 def require_finite(cost: Any, what: str) -> None:

@@ -83,10 +83,17 @@ class Either(Policy):
         return self.best.init(key), self.exploring.init(key)
 
     def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
-        best_carry, best, _ = self.best(carry[0], observation, key)
-        exploring_carry, exploring, _ = self.exploring(carry[1], observation, key)
-        action = jax.tree.map(lambda x, y: jnp.where(self.explore, x, y), exploring, best)
-        return (best_carry, exploring_carry), action, {}
+        def best() -> tuple[Carry, Action]:
+            after, action, _ = self.best(carry[0], observation, key)
+            return (after, carry[1]), action
+
+        def exploring() -> tuple[Carry, Action]:
+            after, action, _ = self.exploring(carry[1], observation, key)
+            return (carry[0], after), action
+
+        # One of them, not both: a policy that plans takes its time.
+        after, action = jax.lax.cond(self.explore, exploring, best)
+        return after, action, {}
 
     def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
         return self.best.inspect(carry[0], observation)

@@ -11,12 +11,16 @@ import jax
 
 from .. import presets
 from ..catalogue import ALGORITHMS, LOOPS, algorithm_row
-from ..core import Algorithm, Environment, Learner, VectorEnv, env_spec
+from ..core import Algorithm, Choices, Environment, Learner, Observed, VectorEnv, env_spec, require_action
 from ..data.checks import require_spec
 from ..data.episodes import Dataset, load_dataset
 from ..envs.gymnasium import hosted
+from ..envs.known import KnownModel
+from ..envs.opponents import Versus
 from ..envs.registry import COMPILED, make
+from ..envs.time_limit import TimeLimit
 from ..envs.vectorize import Vectorized, vectorize
+from ..planning.tree_search import Numbered
 from .config import build, describe, merge, override, resolve
 from .engine import iterations_for, steps_after
 from .evaluate import lanes_for
@@ -119,7 +123,7 @@ def plan(
                     f"{name} acts with several policies in one compiled program, which an environment outside of it ({env_name}) "
                     "cannot follow: use one of `rtg list --envs`, or a2c"
                 )
-            more = _imitation(name, expert, data, vector_env) if kind == "dagger" else {}
+            more = _imitation(name, expert, data, vector_env) if kind == "dagger" else _more(kind, name, vector_env)
             whole = build(cls, options, env=vector_env, learner=inner, **more)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
     iterations = _iterations(whole, steps)
@@ -180,9 +184,11 @@ def from_config(
         whole: Algorithm = build(cls, config["loop"], dataset=load_dataset(config["data"]), learner=inner)
     else:
         vector_env = make(source, described["num_envs"], backend=backend, **described["kwargs"])
-        more = {}
+        name = config["algorithm"]
         if kind == LOOPS["dagger"]:
-            more = _imitation(config["algorithm"], _same_expert(config, expert), config["data"], vector_env)
+            more = _imitation(name, _same_expert(config, expert), config["data"], vector_env)
+        else:
+            more = _more(next(k for k, path in LOOPS.items() if path == kind), name, vector_env)
         whole = build(cls, config["loop"], env=vector_env, learner=inner, **more)
     config = dict(config)
     if steps is not None:
@@ -222,6 +228,33 @@ def _same_expert(config: dict[str, Any], expert: Any) -> Any:
             f"the run's expert is {which}, which a file may not name: give it again with --expert, or rtg.resume(path, expert=...)"
         )
     return described if expert is None else expert
+
+
+def _more(kind: str, name: str, env: VectorEnv) -> dict[str, Any]:
+    """What a loop is given besides environment and learner."""
+    return {"model": search_model(env, name)} if kind in ("distill", "self_play") else {}
+
+
+def search_model(env: VectorEnv, name: str = "a tree search") -> Choices:
+    """What a tree search looks ahead with: the rules of a game, or the environment itself as its own model.
+
+    Raises `ValueError`, in the name of who wants to search, for environments that no search can look ahead in: those outside of the
+    compiled program, those whose observation does not tell their state, and those whose actions are not numbered.
+    """
+    if not isinstance(env, Vectorized):
+        raise ValueError(
+            f"{name} looks ahead in a compiled model, and this environment has none: use one of `rtg list --envs`, such as TicTacToe"
+        )
+    inner = env.env.env if isinstance(env.env, TimeLimit) else env.env
+    if isinstance(inner, Versus):
+        return inner.game
+    if not isinstance(inner, Observed):
+        raise ValueError(
+            f"{name} goes on from what is observed, and an observation of {type(inner).__name__} does not tell its state: "
+            "use CartPole-v1 or TicTacToe"
+        )
+    require_action(name, env_spec(env), ("discrete",))
+    return Numbered(KnownModel(inner), env_spec(env).action.counts[0])
 
 
 def check_budget(steps: Any, seed: Any) -> None:
