@@ -21,6 +21,7 @@ likeliest action (`explore` samples); the newest policy has come to no states ye
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -142,7 +143,7 @@ class DAgger(Algorithm, Configured):
 
     env: VectorEnv
     learner: Learner
-    expert: Policy | None = None
+    expert: Any = None
     demonstrations: Dataset | None = None
     unroll: int = setting(256, "steps in each environment in a round", at_least=1)
     updates: int = setting(200, "gradient steps after each round", at_least=1)
@@ -213,7 +214,7 @@ class DAgger(Algorithm, Configured):
             given = _labelled(self.demonstrations.transitions)
             data = jax.tree.map(lambda room, rows: room.at[: self._given].set(rows), data, given)
         written = jnp.asarray(self._given, jnp.int32)
-        state = DAggerState(learner, actor, data, written, zero, learner, jnp.asarray(jnp.inf), noise)
+        state = DAggerState(learner, actor, data, written, zero, learner, jnp.asarray(jnp.inf, jnp.float32), noise)
         if self._given:
             state = dataclasses.replace(state, learner=self._fit(state, fit_key)[0])
         return state

@@ -114,7 +114,9 @@ class Offline(Algorithm, Configured):
         if not self.validation:
             return OfflineState(learner)
         rows, train = split_rows(self.dataset.transitions, self.validation, jax.random.fold_in(key, 1))
-        return OfflineState(learner, HeldOut(rows, train, learner, jnp.asarray(jnp.inf), jnp.zeros((), jnp.int32)))
+        return OfflineState(
+            learner, HeldOut(rows, train, learner, jnp.asarray(jnp.inf, jnp.float32), jnp.zeros((), jnp.int32))
+        )
 
     def step(self, state: OfflineState, key: PRNGKey) -> tuple[OfflineState, tuple[dict[str, jax.Array], Episodes]]:
         held_out = state.held_out
