@@ -212,6 +212,10 @@ def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
         return rtg.Asynchronous(env, learner, workers=2, unroll=4)
     if row.loop == "off_policy":
         return rtg.OffPolicy(env, learner, rtg.UniformReplay(64), unroll=2, warm_up=8, batch_size=4)
+    if row.loop == "dagger":
+        spec = env_spec(env)
+        expert = rtg.as_expert(lambda observation: spec.action.zeros(), spec)
+        return rtg.DAgger(env, learner, expert, unroll=2, updates=1, batch_size=2)
     if row.loop == "distill":
         return Distill(env, learner, search_model(env), simulations=2, unroll=1, updates=1, batch_size=2)
     if row.loop == "self_play":
