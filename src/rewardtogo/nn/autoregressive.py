@@ -45,7 +45,8 @@ class Autoregressive(HeadRecipe):
         feature_key, table_key, out_key = jax.random.split(key, 3)
         table = jax.random.normal(table_key, (entries, entries, widest, self.hidden)) / math.sqrt(entries)
         out = jax.vmap(lambda k: Linear.of(self.hidden, widest, k, 0.01))(jax.random.split(out_key, entries))
-        return AutoregressiveHead(Linear.of(features, entries * self.hidden, feature_key), table, out, counts, spec)
+        inputs = Linear.of(features, entries * self.hidden, feature_key)
+        return AutoregressiveHead(inputs=inputs, table=table, out=out, counts=counts, spec=spec)
 
 
 class AutoregressiveHead(Head):

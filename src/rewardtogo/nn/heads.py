@@ -84,7 +84,7 @@ class ActionHead(Head):
         outputs = sum(spec.counts) if spec.counts else spec.size
         scale = half_width(spec)
         spread = jnp.full(spec.shape, log_std) + jnp.log(scale) if spec.kind == "box" else jnp.zeros(0)
-        return ActionHead(Linear.of(features, outputs, key, gain), spread, spec)
+        return ActionHead(linear=Linear.of(features, outputs, key, gain), log_std=spread, spec=spec)
 
     def __call__(self, features: Float[Array, "F"], mask: Array | None = None) -> Distribution:
         out = self.linear(features)

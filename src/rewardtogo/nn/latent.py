@@ -46,15 +46,15 @@ class Latent(HeadRecipe):
         require_kind(self, spec)
         keys = jax.random.split(key, 5)
         return LatentHead(
-            Linear.of(features, self.hidden, keys[0]),
-            Linear.of(self.size, self.hidden, keys[1], Z_GAIN),
-            Linear.of(self.hidden, spec.size, keys[2], 0.5),
-            Linear.of(features + spec.size, self.hidden, keys[3]),
-            Linear.of(self.hidden, 2 * self.size, keys[4], 0.1),
+            observed=Linear.of(features, self.hidden, keys[0]),
+            hidden=Linear.of(self.size, self.hidden, keys[1], Z_GAIN),
+            mean=Linear.of(self.hidden, spec.size, keys[2], 0.5),
+            encoder=Linear.of(features + spec.size, self.hidden, keys[3]),
+            posterior=Linear.of(self.hidden, 2 * self.size, keys[4], 0.1),
             # A wide Gaussian explains everything by itself, and the hidden variable is then never used.
-            jnp.log(jnp.asarray(0.1 * half_width(spec))),
-            spec,
-            self.samples,
+            log_std=jnp.log(jnp.asarray(0.1 * half_width(spec))),
+            spec=spec,
+            samples=self.samples,
         )
 
 

@@ -34,7 +34,8 @@ class Mixture(HeadRecipe):
         places = jax.random.uniform(place_key, means.bias.shape, minval=-1.0, maxval=1.0)
         means = eqx.tree_at(lambda m: m.bias, means, places)
         log_std = jnp.broadcast_to(jnp.log(0.5 * half_width(spec)), (count, *spec.shape))
-        return MixtureHead(Linear.of(features, count, weight_key, 0.01), means, log_std, spec)
+        weights = Linear.of(features, count, weight_key, 0.01)
+        return MixtureHead(weights=weights, means=means, log_std=log_std, spec=spec)
 
 
 class MixtureHead(Head):
