@@ -184,7 +184,7 @@ def test_a_sweep_is_a_vmap():
 def test_the_catalogue_says_what_learners_do():
     loops = {
         "rollout": ("on_policy", "asynchronous"),
-        "transitions": ("off_policy", "offline", "distill", "self_play"),
+        "transitions": ("off_policy", "offline", "dagger", "distill", "self_play"),
         "sequences": ("off_policy", "offline"),
     }
     tested = {type(algorithm(name).learner) for name in ALGORITHMS_UNDER_TEST}  # type: ignore[attr-defined]

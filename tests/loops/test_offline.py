@@ -13,7 +13,7 @@ import pytest
 from rewardtogo.core import Batch, EnvSpec, Learner, Number, Transition, from_space, number, setting
 from rewardtogo.data import Dataset
 from rewardtogo.loops import RandomPolicy
-from rewardtogo.loops.offline import Offline
+from rewardtogo.loops.offline import Offline, sample_batch
 from rewardtogo.nn import GRU, MLP
 from rewardtogo.ops.schedules import Linear
 from rewardtogo.policy_gradient.ppo import PPO
@@ -91,9 +91,14 @@ def test_draws_are_uniform(algorithm, key):
     assert np.abs(share - 1 / 8).max() < 4 * error
 
 
+def drawn(algorithm, learner, key):
+    a = algorithm
+    return sample_batch(a.learner, learner, a.dataset.transitions, a.dataset.num_steps, a.batch_size, a.length, key)
+
+
 def test_windows_are_consecutive_and_wrap(key):
     algorithm = Offline(counting(), Tally(wants="sequences"), batch_size=200, length=12).with_horizon(100)
-    t = algorithm._sample(algorithm.learner.init(SPEC, key), key).transitions
+    t = drawn(algorithm, algorithm.learner.init(SPEC, key), key).transitions
     place = np.asarray(t.reward, int)
     assert place.shape == (12, 200) and t.observation.shape == (12, 200, 1)
     assert np.array_equal(place[1:], (place[:-1] + 1) % 8)
@@ -104,7 +109,7 @@ def test_windows_are_consecutive_and_wrap(key):
 def test_sequences_begin_with_a_fresh_memory(key):
     algorithm = Offline(counting(), DQN(network=GRU(4, MLP(3))), batch_size=6, length=5).with_horizon(100)
     state = algorithm.init(key)
-    batch = algorithm._sample(state.learner, key)
+    batch = drawn(algorithm, state.learner, key)
     carry = batch.transitions.extras["carry"]
     assert all(x.shape[:2] == (5, 6) and not np.any(x) for x in jax.tree.leaves(carry))
     new, (metrics, _) = jax.jit(lambda a, s, k: a.step(s, k))(algorithm, state, key)
@@ -134,7 +139,7 @@ def test_every_leaf_of_the_state_is_an_array(key):
 
 def test_more_than_there_is_in_a_batch(key):
     algorithm = Offline(counting(), Tally(), batch_size=50).with_horizon(100)
-    assert algorithm._sample(None, key).transitions.reward.shape == (50,)
+    assert drawn(algorithm, None, key).transitions.reward.shape == (50,)
 
 
 @pytest.mark.parametrize(

@@ -181,14 +181,16 @@ def test_candidates_are_weighed_side_by_side(item):
     one = jax.jit(lambda u: total_cost(problem, start, u, KEY))
     together, alone = batch(candidates), [one(u) for u in candidates]
     clock = lambda f: (time.perf_counter(), jax.block_until_ready(f()), time.perf_counter())  # noqa: E731
-    ratios = []
-    for _ in range(3):
+    # The least of several times each: another process that takes the core meanwhile only ever adds.
+    batched, looped = [], []
+    for _ in range(8):
         a, _, b = clock(lambda: batch(candidates))
         c, _, d = clock(lambda: [one(u) for u in candidates])
-        ratios.append((d - c) / (b - a))
+        batched.append(b - a)
+        looped.append(d - c)
     with item("8.16") as check:
         check(float(np.abs(np.asarray(together) - np.asarray(alone)).max()), "<=", 1e-4, "batch against the loop")
-        check(max(ratios), ">=", 10, "how much sooner 500 are done together")
+        check(min(looped) / min(batched), ">=", 10, "how much sooner 500 are done together")
 
 
 def test_mpc_is_the_regulator(item, x64):
