@@ -123,6 +123,9 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "mbrl-ts1": lambda: off_policy(
         rtg.ModelBased(sizes=(8,), members=2, planner=RandomShooting(samples=6), horizon=3, every=2, propagation="ts1")
     ),
+    "fvi": lambda: off_policy(
+        rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)
+    ),
     "q-learning": lambda: rtg.OnPolicy(rtg.make("CliffWalking-v1", NUM_ENVS), QLearning(gamma=0.9), unroll=4),
     "double-q-learning": lambda: rtg.OnPolicy(
         rtg.make("Taxi-v4", NUM_ENVS), QLearning(double=True, exploration=Boltzmann(0.5), initial=1.0), unroll=4

@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from .value.cem_q import CEMQ as CEMQ
     from .value.ddpg import DDPG as DDPG
     from .value.dqn import DQN as DQN
+    from .value.fvi import FVI as FVI
     from .value.maximisers import CEM as CEM
     from .value.maximisers import Ascent as Ascent
     from .value.maximisers import Sampled as Sampled
@@ -120,6 +121,7 @@ _HOMES = {
     "value.cem_q": "CEMQ",
     "value.ddpg": "DDPG",
     "value.dqn": "DQN",
+    "value.fvi": "FVI",
     "value.maximisers": "Ascent CEM Sampled",
     "value.naf": "NAF",
     "value.noise": "Gaussian OU",

@@ -246,6 +246,18 @@ ALGORITHMS: dict[str, Row] = {
             {"target_period": 500, "huber": 1e6, "learning_rate": 1e-3},
         ),
         Row(
+            "fvi",
+            "rewardtogo.value.fvi:FVI",
+            "off_policy",
+            "5",
+            "Alg 8",
+            ("discrete",),
+            "fitted value iteration: every action tried in a simulator, V fitted to the best; known dynamics",
+            {},
+            {"updates": 4, "unroll": 1},
+            num_envs=4,
+        ),
+        Row(
             "q_learning",
             "rewardtogo.value.tabular_q:QLearning",
             "on_policy",

@@ -204,7 +204,8 @@ def test_every_public_name_is_on_the_api_page():
 
 def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
     """The smallest algorithm of a row of the catalogue."""
-    learner = build(resolve(row.path), row.learner)
+    simulated = {"dynamics": {"class": "simulator", "env": env_name}} if row.name == "fvi" else {}
+    learner = build(resolve(row.path), row.learner | simulated)
     env = rtg.make("FrozenLake-v1" if isinstance(learner, rtg.QLearning) else env_name, 2)
     if row.loop == "on_policy":
         return rtg.OnPolicy(env, learner, unroll=8)

@@ -48,6 +48,14 @@ class Observed(Environment):
         """The state that looks like this."""
 
 
+class Dynamics(eqx.Module):
+    """A recipe of dynamics that are known: what a file can say in place of an environment."""
+
+    @abstractmethod
+    def build(self) -> Observed:
+        """An environment that goes on from any observation."""
+
+
 class VectorEnv(eqx.Module):
     """B environments side by side, which reset themselves: `Timestep.observation` opens the next episode where one ended."""
 

@@ -24,6 +24,7 @@ from .registry import make as make
 from .reward_wrappers import NormalizeReward as NormalizeReward
 from .reward_wrappers import RewardFunction as RewardFunction
 from .reward_wrappers import ScaleReward as ScaleReward
+from .simulator import Simulator as Simulator
 from .tabular import MDP as MDP
 from .tabular import POMDP as POMDP
 from .tabular import TabularEnv as TabularEnv

@@ -18,6 +18,7 @@ from ..catalogue import nearest
 from ..core import Schedule
 from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
+from ..envs.simulator import Simulator
 from ..nn import CNN, GRU, LSTM, MLP, Autoregressive, Latent, Mixture, Network, Stacked, Standard
 from ..ops.schedules import parse_schedule, to_text
 from ..planning.mpc import (
@@ -41,7 +42,9 @@ _HEADS = (Standard, Mixture, Autoregressive, Latent)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
 _PLANNERS = (RandomShooting, CrossEntropy, PathIntegral, GradientShooting, NewtonShooting, ILQR, Collocation)
-PARTS: dict[str, type] = {c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES, *_PLANNERS)}
+PARTS: dict[str, type] = {
+    c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES, *_PLANNERS, Simulator)
+}
 PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
 
 

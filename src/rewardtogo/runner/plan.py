@@ -18,6 +18,7 @@ from ..envs.gymnasium import hosted
 from ..envs.known import KnownModel
 from ..envs.opponents import Versus
 from ..envs.registry import COMPILED, make
+from ..envs.simulator import Simulator, simulator_of
 from ..envs.time_limit import TimeLimit
 from ..envs.vectorize import Vectorized, vectorize
 from ..planning.tree_search import Numbered
@@ -91,7 +92,7 @@ def plan(
         # A learner object says what it wants: a preset's values are for names.
         row = ALGORITHMS.get(algorithm) if isinstance(algorithm, str) else None
         known = {} if row is None else merge(row.learner, ready.get("learner", {}))
-        inner = _learner(algorithm, merge(known, learner or {}))
+        inner = _knowing(_learner(algorithm, merge(known, learner or {})), env, env_name)
         options = merge(merge({} if row is None else row.loop_options, ready.get("loop", {})), loop or {})
         kind = row.loop if row is not None else ("on_policy" if inner.batch == "rollout" else "off_policy")
         if data is not None and kind != "dagger":
@@ -339,6 +340,15 @@ def _learner(algorithm: str | Learner, data: dict[str, Any]) -> Learner:
     if not (isinstance(cls, type) and issubclass(cls, Learner)):
         raise ValueError(f"{algorithm} is no learner: name a class that derives from rewardtogo.Learner")
     return build(cls, data)
+
+
+def _knowing(learner: Learner, env: Any, name: str) -> Learner:
+    """The learner with the run's environment as the dynamics that it knows, where it has to know some and none are named."""
+    if getattr(learner, "dynamics", learner) is not None:
+        return learner
+    inner = env.env if isinstance(env, Vectorized) else env
+    known = simulator_of(inner, name) if name not in COMPILED and isinstance(inner, Environment) else Simulator(name)
+    return dataclasses.replace(learner, dynamics=known)  # type: ignore[call-arg]
 
 
 def _learner_of(algorithm: Algorithm) -> Any:
