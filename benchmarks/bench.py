@@ -39,7 +39,6 @@ PEERS = {
     "mdptoolbox": "pymdptoolbox",
     "mctx": "mctx",
 }
-NOT_MEASURED = "not measured"
 ZOO = (
     "--preset none --num-envs 8 --loop.unroll 32 --learner.epochs 20 --learner.minibatches 1 --learner.gamma 0.98 "
     "--learner.gae-lambda 0.8 --learner.learning-rate linear:0.001:0 --learner.clip linear:0.2:0"
@@ -113,10 +112,10 @@ class Row:
         """Text, one a column."""
         met = "" if self.met is None else "yes" if self.met else "NO"
         ratio = "" if self.ratio is None else f"{self.ratio:.2f}"
-        return [self.what, self.ours, self.peer, ratio, self.required, met, NOT_MEASURED]
+        return [self.what, self.ours, self.peer, ratio, self.required, met]
 
 
-COLUMNS = ["what", "ours", "peer", "ratio", "required", "met?", "GPU"]
+COLUMNS = ["what", "ours", "peer", "ratio", "required", "met?"]
 
 
 def say(text: str) -> None:

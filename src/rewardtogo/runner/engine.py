@@ -225,7 +225,9 @@ class Program:
         heavy, light = iter(big), iter(small)
         state = jax.tree.unflatten(structure, [next(heavy) if is_large else next(light) for is_large in large])
         one = lambda seed: self._run_one(algorithm, seed[0], seed[1], seed[2], start, stop, every)  # noqa: E731
-        most = max(1, STEPS_AT_ONCE // algorithm.steps_per_iteration)
+        most = (
+            max(1, STEPS_AT_ONCE // algorithm.steps_per_iteration) if jax.default_backend() == "cpu" else self.key.size
+        )
         state, sums, table = by_groups(one, (state, sums, key), most) if self.batched else one((state, sums, key))
         return jax.tree.leaves(state), sums, table
 
