@@ -177,8 +177,10 @@ def test_candidates_are_weighed_side_by_side(item):
     problem = swing_up(50)
     start = jnp.asarray([np.pi, 0.0])
     candidates = jax.random.normal(KEY, (500, 50, 1))
-    batch = jax.jit(lambda c: mean_costs(problem, start, c, KEY))
-    one = jax.jit(lambda u: total_cost(problem, start, u, KEY))
+    # As users' programs are compiled, and not as tests are (tests/conftest.py).
+    usual = {"xla_backend_optimization_level": 3}
+    batch = jax.jit(lambda c: mean_costs(problem, start, c, KEY), compiler_options=usual)
+    one = jax.jit(lambda u: total_cost(problem, start, u, KEY), compiler_options=usual)
     together, alone = batch(candidates), [one(u) for u in candidates]
     clock = lambda f: (time.perf_counter(), jax.block_until_ready(f()), time.perf_counter())  # noqa: E731
     # The least of several times each: another process that takes the core meanwhile only ever adds.
