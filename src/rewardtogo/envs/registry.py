@@ -17,12 +17,13 @@ from .gymnasium import GymnasiumEnv, Source
 from .mountain_car import MountainCar, MountainCarContinuous
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
+from .pixel_pendulum import PixelPendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
 from .time_limit import TimeLimit
 from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
-from .wrappers import MaskObservation
+from .wrappers import FrameStack, MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
@@ -36,6 +37,8 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
     "Catch": Catch,
+    "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
+    "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
     "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),
