@@ -132,6 +132,16 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
             horizon=3,
         )
     ),
+    "planet": lambda: continuous(
+        rtg.PlaNet(
+            memory_size=4,
+            state_size=2,
+            encoder_sizes=(8, 6),
+            sizes=(8,),
+            planner=CrossEntropy(samples=6, elites=2, iterations=2),
+            horizon=3,
+        )
+    ),
     "fvi": lambda: off_policy(
         rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)
     ),

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .loops.on_policy import OnPolicy as OnPolicy
     from .model_based.latent import LatentMBRL as LatentMBRL
     from .model_based.mbrl import ModelBased as ModelBased
+    from .model_based.planet import PlaNet as PlaNet
     from .nn.autoregressive import Autoregressive as Autoregressive
     from .nn.heads import Standard as Standard
     from .nn.latent import Latent as Latent
@@ -105,6 +106,7 @@ _HOMES = {
     "loops.on_policy": "OnPolicy",
     "model_based.latent": "LatentMBRL",
     "model_based.mbrl": "ModelBased",
+    "model_based.planet": "PlaNet",
     "nn.autoregressive": "Autoregressive",
     "nn.heads": "Standard",
     "nn.latent": "Latent",

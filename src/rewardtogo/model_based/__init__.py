@@ -7,3 +7,4 @@ from .latent import LatentMBRL as LatentMBRL
 from .latent import LatentModel as LatentModel
 from .latent_linear import fit_linear_gaussian as fit_linear_gaussian
 from .mbrl import ModelBased as ModelBased
+from .planet import PlaNet as PlaNet
