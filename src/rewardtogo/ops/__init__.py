@@ -30,6 +30,12 @@ from .importance import importance_weights as importance_weights
 from .importance import log_ratio as log_ratio
 from .importance import normalised_weights as normalised_weights
 from .importance import self_normalised_mean as self_normalised_mean
+from .kalman import Filtered as Filtered
+from .kalman import LinearGaussian as LinearGaussian
+from .kalman import Smoothed as Smoothed
+from .kalman import kalman_filter as kalman_filter
+from .kalman import kalman_smoother as kalman_smoother
+from .kalman import simulate_linear as simulate_linear
 from .linalg import conjugate_gradients as conjugate_gradients
 from .linalg import inner as inner
 from .mixtures import GaussianMixture as GaussianMixture
