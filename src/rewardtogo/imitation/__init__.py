@@ -1,5 +1,6 @@
 """Chapter 2: imitation learning."""
 
+from .augment import augmented as augmented
 from .bc import BC as BC
 from .dagger import DAgger as DAgger
 from .dagger import Queries as Queries
