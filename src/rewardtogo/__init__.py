@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .loops.on_policy import OnPolicy as OnPolicy
     from .model_based.mbrl import ModelBased as ModelBased
     from .nn.autoregressive import Autoregressive as Autoregressive
+    from .nn.entries import Entries as Entries
     from .nn.heads import Standard as Standard
     from .nn.latent import Latent as Latent
     from .nn.mixture import Mixture as Mixture
@@ -104,6 +105,7 @@ _HOMES = {
     "loops.on_policy": "OnPolicy",
     "model_based.mbrl": "ModelBased",
     "nn.autoregressive": "Autoregressive",
+    "nn.entries": "Entries",
     "nn.heads": "Standard",
     "nn.latent": "Latent",
     "nn.mixture": "Mixture",
