@@ -139,6 +139,7 @@ _ROOMS = (
     "exact",
     "figures",
     "imitation",
+    "label",
     "loops",
     "model_based",
     "nn",
