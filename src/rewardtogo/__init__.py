@@ -141,6 +141,7 @@ _ROOMS = (
     "exact",
     "figures",
     "imitation",
+    "label",
     "loops",
     "model_based",
     "nn",
