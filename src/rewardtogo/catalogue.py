@@ -31,7 +31,12 @@ ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 _VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
 _DQN = "rewardtogo.value.dqn:DQN"
 _ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
-_ONE_MODEL = {"members": 1, "probabilistic": False, "bootstrap": False, "propagation": "mean"}
+_ONE_MODEL = {
+    "members": 1,
+    "probabilistic": False,
+    "posterior": {"class": "bootstrap", "resample": False},
+    "propagation": "mean",
+}
 _EVERY_STEP = {"unroll": 1, "batch_size": 256, "replay": {"capacity": 1_000_000}}
 
 ALGORITHMS: dict[str, Row] = {
