@@ -145,6 +145,15 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
             patience=2,
         )
     ),
+    "latent-mbrl": lambda: continuous(
+        rtg.LatentMBRL(
+            latent_size=3,
+            encoder_sizes=(8,),
+            sizes=(8,),
+            planner=CrossEntropy(samples=6, elites=2, iterations=2),
+            horizon=3,
+        )
+    ),
     "fvi": lambda: off_policy(
         rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)
     ),

@@ -4,8 +4,8 @@ $$\log p(o_{1:T} \mid a) \ge \mathcal{L}(q) = \underbrace{E_q\Big[\log p(s_1) + 
 + \sum_{t=1}^{T} \log p(o_t \mid s_t)\Big]}_{\text{what the notes maximise}} + H(q),$$
 
 with equality for the posterior $q = p(s_{1:T} \mid o_{1:T}, a_{1:T})$, which is the smoother's and not the filter's (erratum E8.18).
-The notes leave the entropy $H(q)$ out: with a posterior that is computed it does not depend on the model and may be left out of the
-M-step, with an encoder that is learned it may not (erratum E8.17: a deterministic one makes the objective unbounded).
+The notes leave the entropy $H(q)$ out: with a posterior that is computed it does not depend on the model and may be left out of the M-step,
+with an encoder that is learned it may not (erratum E8.17: a deterministic one makes the objective unbounded).
 
 Encoders, from crude to exact: of one frame $q(s_t \mid o_t)$, the filter's $q(s_t \mid o_{1:t}, a_{1:t-1})$, and the smoother's pairs
 $q(s_t, s_{t+1} \mid o_{1:T}, a_{1:T})$. `fit_linear_gaussian` alternates the last with the maximum of the objective in closed form, which
