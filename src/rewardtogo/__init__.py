@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from .model_based.mbrl import ModelBased as ModelBased
     from .model_based.planet import PlaNet as PlaNet
     from .nn.autoregressive import Autoregressive as Autoregressive
+    from .nn.entries import Entries as Entries
     from .nn.heads import Standard as Standard
     from .nn.latent import Latent as Latent
     from .nn.mixture import Mixture as Mixture
@@ -108,6 +109,7 @@ _HOMES = {
     "model_based.mbrl": "ModelBased",
     "model_based.planet": "PlaNet",
     "nn.autoregressive": "Autoregressive",
+    "nn.entries": "Entries",
     "nn.heads": "Standard",
     "nn.latent": "Latent",
     "nn.mixture": "Mixture",
@@ -143,6 +145,7 @@ _ROOMS = (
     "exact",
     "figures",
     "imitation",
+    "label",
     "loops",
     "model_based",
     "nn",

@@ -46,8 +46,8 @@ from ..nn import Linear, Optimiser, RunningNorm, flat_size, flatten_observation
 from ..ops.distributions import DiagGaussian
 from ..planning.mpc import CrossEntropy, Planner, shifted
 from ..planning.problem import ModelProblem
-from .ensembles import encode_action
 from .latent import Dense
+from .learned import encode_action
 
 LEAST_STD = 0.1
 """Of the random state, as in PlaNet."""

@@ -4,6 +4,11 @@ from .advantages import gae as gae
 from .advantages import gae_weights as gae_weights
 from .advantages import n_step_advantages as n_step_advantages
 from .advantages import normalise as normalise
+from .bayesian import LinearPrediction as LinearPrediction
+from .bayesian import NormalInverseGamma as NormalInverseGamma
+from .bayesian import StudentT as StudentT
+from .bayesian import linear_posterior as linear_posterior
+from .bayesian import linear_prediction as linear_prediction
 from .distributional import categorical_projection as categorical_projection
 from .distributional import quantile_huber as quantile_huber
 from .distributional import quantile_levels as quantile_levels
