@@ -46,8 +46,10 @@ if TYPE_CHECKING:
     from .loops.off_policy import OffPolicy as OffPolicy
     from .loops.offline import Offline as Offline
     from .loops.on_policy import OnPolicy as OnPolicy
+    from .model_based.latent import LatentMBRL as LatentMBRL
     from .model_based.mbrl import ModelBased as ModelBased
     from .nn.autoregressive import Autoregressive as Autoregressive
+    from .nn.entries import Entries as Entries
     from .nn.heads import Standard as Standard
     from .nn.latent import Latent as Latent
     from .nn.mixture import Mixture as Mixture
@@ -102,8 +104,10 @@ _HOMES = {
     "loops.off_policy": "OffPolicy",
     "loops.offline": "Offline",
     "loops.on_policy": "OnPolicy",
+    "model_based.latent": "LatentMBRL",
     "model_based.mbrl": "ModelBased",
     "nn.autoregressive": "Autoregressive",
+    "nn.entries": "Entries",
     "nn.heads": "Standard",
     "nn.latent": "Latent",
     "nn.mixture": "Mixture",

@@ -6,18 +6,21 @@ import pytest
 from theory_problems import problem, problems
 
 from rewardtogo.envs.tabular_problems import random_mdp, random_policy
-from rewardtogo.exact import greedy_policy, state_distributions
+from rewardtogo.exact import (
+    greedy_policy,
+    mixture_decomposition,
+    policy_closeness,
+    separation,
+    state_distributions,
+    state_l1_bound,
+    tv_rows,
+)
 from rewardtogo.policy_gradient.couplings import (
     expectation_lower_bound,
     kl_rows,
     kl_to_tv,
     maximal_coupling,
-    mixture_decomposition,
-    policy_closeness,
     sample_maximal_coupling,
-    separation,
-    state_l1_bound,
-    tv_rows,
     tv_to_kl,
 )
 

@@ -6,8 +6,8 @@ from theory_problems import drifting, problems
 
 from rewardtogo.envs.tabular import MDP
 from rewardtogo.envs.tabular_problems import random_mdp, random_policy
-from rewardtogo.exact import advantage_values, expected_return
-from rewardtogo.policy_gradient.couplings import kl_rows, kl_to_tv, policy_closeness, tv_rows
+from rewardtogo.exact import advantage_values, expected_return, policy_closeness, tv_rows
+from rewardtogo.policy_gradient.couplings import kl_rows, kl_to_tv
 from rewardtogo.policy_gradient.theory import performance_difference, surrogate_advantage
 from rewardtogo.policy_gradient.trust_regions import (
     advantage_limit,

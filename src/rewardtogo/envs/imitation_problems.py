@@ -5,6 +5,13 @@
     LastTwo      answer the XOR of the last two observations                          no Markov policy will do (2.3.1)
     Braking      brake for an obstacle, with a light that shows what was done last    causal confusion (2.3.1)
 
+    tightrope    (in `tabular_problems`) one mistake, and nothing but mistakes ever after         the error bounds (2.4)
+
+Their experts are functions here as well, for `--expert rewardtogo.envs.imitation_problems:steer`:
+
+    Steering    steer_by_picture      Lane     steer      BrakeLight    brake
+    Drone       pass_the_tree         Tightrope    balance
+
 All are our own.
 """
 
@@ -16,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
+from .tabular_problems import TIGHTROPE_EXPERT
 
 SIDE, WIDTH, SPREAD = 0.5, 0.3, 0.05
 """Of `Drone`: where the expert flies beside the tree's middle, half the tree, and how much the expert's headings vary."""
@@ -129,6 +137,20 @@ def draw_road(offset: Float[Array, ""], direction: Float[Array, ""]) -> UInt8[Ar
     return (255.0 * jnp.exp(-0.5 * jnp.square(across))).astype(jnp.uint8)[..., None]
 
 
+def side_view(picture: UInt8[Array, "16 16 1"], offset: float, direction: float = 0.0) -> UInt8[Array, "16 16 1"]:
+    """What a camera would see that sits `offset` further to the right of the lane, and looks `direction` further to the right.
+
+    Each row is moved as the road would be there, in between pixels by linear interpolation; what comes into sight is dark.
+    """
+    ahead = jnp.linspace(2.0, 0.0, SIZE)
+    source = jnp.arange(SIZE, dtype=jnp.float32)[None, :] + 6.0 * (offset + ahead * direction)[:, None]
+    rows = picture[..., 0].astype(jnp.float32)
+    moved = jax.vmap(lambda x, row: jnp.interp(x, jnp.arange(SIZE, dtype=jnp.float32), row, left=0.0, right=0.0))(
+        source, rows
+    )
+    return moved.astype(jnp.uint8)[..., None]
+
+
 def read_picture(picture: UInt8[Array, "16 16 1"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Offset and direction, from where the line is in the rows of a picture; right to about a hundredth where it is in sight."""
     light = picture[..., 0].astype(jnp.float32)
@@ -180,7 +202,8 @@ class Braking(Environment):
     Observes (sensor, light, obstacle): a sensor that is wrong in 2 % of the steps; a light on the dashboard that shows the last
     action (0 where not `light`); and the truth, for the expert alone. Obstacles come and go with probability 1 %, so that the
     expert's last action tells its next one better than the sensor does: data that teaches to do what was done last, which
-    is of no use to whoever then does it (causal confusion; de Haan et al. 2019).
+    is of no use to whoever then does it (causal confusion; de Haan et al. 2019). Show a pupil the first two entries only, by the
+    network `Entries((0, 1))`.
     """
 
     light: bool = eqx.field(default=True, static=True)
@@ -213,3 +236,28 @@ class Braking(Environment):
     def _observe(self, obstacle: Array, last: Array, key: Array) -> Array:
         sensor = jnp.where(jax.random.bernoulli(key, 0.02), 1.0 - obstacle, obstacle)
         return jnp.stack([sensor, last if self.light else jnp.zeros(()), obstacle])
+
+
+def steer(observation: Float[Array, "3"]) -> Float[Array, "1"]:
+    """The expert of `Lane`."""
+    return Lane().expert(observation)
+
+
+def steer_by_picture(observation: UInt8[Array, "16 16 1"]) -> Int[Array, ""]:
+    """The expert of `Steering`, which is `Lane(picture=True)`."""
+    return Lane(picture=True).expert(observation)
+
+
+def brake(observation: Float[Array, "3"]) -> Int[Array, ""]:
+    """The expert of `BrakeLight`, which is `Braking()`: it sees what its pupil does not."""
+    return Braking().expert(observation)
+
+
+def pass_the_tree(observation: Float[Array, "1"], key: PRNGKey) -> Float[Array, "1"]:
+    """The expert of `Drone`."""
+    return Drone().expert(observation, key)
+
+
+def balance(observation: Int[Array, ""]) -> Int[Array, ""]:
+    """The expert of `Tightrope`."""
+    return jnp.asarray(TIGHTROPE_EXPERT, jnp.int32)[observation]

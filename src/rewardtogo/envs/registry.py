@@ -14,15 +14,19 @@ from .cartpole import CartPole
 from .catch import Catch
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
+from .imitation_problems import Braking, Drone, Lane, LastTwo
 from .mountain_car import MountainCar, MountainCarContinuous
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
+from .pixel_pendulum import PixelPendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
+from .tabular import TabularEnv
+from .tabular_problems import tightrope
 from .time_limit import TimeLimit
 from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
-from .wrappers import MaskObservation
+from .wrappers import FrameStack, MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
@@ -36,6 +40,14 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Pendulum-v1": lambda: TimeLimit(Pendulum(), 200),
     "PendulumNoVel-v1": lambda: TimeLimit(MaskObservation(Pendulum(), keep=(0, 1)), 200),
     "Catch": Catch,
+    "Steering": lambda: TimeLimit(Lane(picture=True), 1000),
+    "Lane": lambda: TimeLimit(Lane(), 200),
+    "BrakeLight": Braking,
+    "LastTwo": LastTwo,
+    "Drone": Drone,
+    "Tightrope": lambda: TabularEnv(tightrope()),
+    "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
+    "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
     "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),

@@ -1,4 +1,4 @@
-"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, a corridor of aliased states, a random walk.
+"""Small problems with known answers: random MDPs for property tests, a Pacman-like board, a tightrope, an aliased corridor, a walk.
 
 Source: notes, section 1.1 (the Pacman reward, observations); Sutton and Barto (2018), examples 7.1 (the walk) and 13.1 (the corridor);
 Singh, Jaakkola and Jordan (1994) on why a memoryless policy may have to be stochastic there.
@@ -58,6 +58,25 @@ def random_policy(
     """A random table of action probabilities `[S, A]`, or `[T, S, A]` for a `horizon`; every action is possible."""
     lead = () if horizon is None else (horizon,)
     return _dirichlet(np.random.default_rng(seed), 1.0, (*lead, num_states, num_actions))
+
+
+ROPE, GROUND = 0, 1
+"""States of `tightrope`."""
+TIGHTROPE_EXPERT = np.array([0, 1])
+"""What its expert does in each state: step along the rope, climb back up."""
+
+
+def tightrope(horizon: int = 50, *, recovers: bool = True) -> MDP:
+    """The worst problem for a copy (notes 2.4): `ROPE` and `GROUND`, actions 0 step and 1 climb, reward 1 where a step ends on the rope.
+
+    Stepping on the rope keeps one there, any other action on it falls; on the ground, climbing leads back to the rope, or, unless it
+    `recovers`, nothing does. The expert (`TIGHTROPE_EXPERT`) never falls, so that its data does not say what to do on the ground, and a
+    copy that steps there too makes a mistake in every step after its first one.
+    """
+    transitions = np.zeros((2, 2, 2))
+    transitions[[ROPE, ROPE, GROUND], [0, 1, 0], [ROPE, GROUND, GROUND]] = 1
+    transitions[GROUND, 1, ROPE if recovers else GROUND] = 1
+    return MDP(transitions, transitions[..., ROPE], ROPE, 1.0, horizon=horizon)
 
 
 def _dirichlet(rng: np.random.Generator, concentration: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -39,6 +39,14 @@ from .gradients import fisher_matrix as fisher_matrix
 from .gradients import policy_gradient as policy_gradient
 from .gradients import policy_return as policy_return
 from .gradients import state_visits as state_visits
+from .mismatch import MixtureDecomposition as MixtureDecomposition
+from .mismatch import check_share as check_share
+from .mismatch import mixture_decomposition as mixture_decomposition
+from .mismatch import policy_closeness as policy_closeness
+from .mismatch import separation as separation
+from .mismatch import state_l1_bound as state_l1_bound
+from .mismatch import state_mismatch as state_mismatch
+from .mismatch import tv_rows as tv_rows
 from .monte_carlo import Estimate as Estimate
 from .monte_carlo import monte_carlo_return as monte_carlo_return
 from .monte_carlo import simulate as simulate

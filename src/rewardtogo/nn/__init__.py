@@ -10,6 +10,7 @@ from .encoding import action_mask as action_mask
 from .encoding import flat_size as flat_size
 from .encoding import flatten_observation as flatten_observation
 from .encoding import has_images as has_images
+from .entries import Entries as Entries
 from .heads import ACTION_KINDS as ACTION_KINDS
 from .heads import ActionHead as ActionHead
 from .heads import Head as Head

@@ -1,16 +1,16 @@
 """Policy gradients and trust regions: chapters 3 and 7."""
 
-from .couplings import MixtureDecomposition as MixtureDecomposition
+from ..exact import MixtureDecomposition as MixtureDecomposition
+from ..exact import mixture_decomposition as mixture_decomposition
+from ..exact import policy_closeness as policy_closeness
+from ..exact import separation as separation
+from ..exact import state_l1_bound as state_l1_bound
+from ..exact import tv_rows as tv_rows
 from .couplings import expectation_lower_bound as expectation_lower_bound
 from .couplings import kl_rows as kl_rows
 from .couplings import kl_to_tv as kl_to_tv
 from .couplings import maximal_coupling as maximal_coupling
-from .couplings import mixture_decomposition as mixture_decomposition
-from .couplings import policy_closeness as policy_closeness
 from .couplings import sample_maximal_coupling as sample_maximal_coupling
-from .couplings import separation as separation
-from .couplings import state_l1_bound as state_l1_bound
-from .couplings import tv_rows as tv_rows
 from .couplings import tv_to_kl as tv_to_kl
 from .duals import DualDescent as DualDescent
 from .duals import dual_gradient_descent as dual_gradient_descent

@@ -20,8 +20,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..envs.tabular import MDP
-from ..exact import advantage_values, check_policy, expected_return, horizon_of, q_values
-from .couplings import check_share, kl_rows, policy_closeness
+from ..exact import (
+    advantage_values,
+    check_policy,
+    check_share,
+    expected_return,
+    horizon_of,
+    policy_closeness,
+    q_values,
+)
+from .couplings import kl_rows
 from .theory import PolicyTable, discounted_visits, surrogate_advantage
 
 
