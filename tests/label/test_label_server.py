@@ -65,7 +65,7 @@ class Served:
         self.run, self.error = run, None
         self.listening = listen("127.0.0.1", 0)
         self.port = self.listening.getsockname()[1]
-        self.thread = threading.Thread(target=self._serve, args=(pause,))
+        self.thread = threading.Thread(target=self._serve, args=(pause,), daemon=True)
         self.thread.start()
 
     def _serve(self, pause: float) -> None:
