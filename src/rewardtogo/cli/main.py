@@ -249,6 +249,29 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument("--seed", type=_seed, default=0)
     p.add_argument("--out", metavar="FILE.gif|.mp4", help="also draw an episode")
     p.add_argument("--json", action="store_true")
+    p = command(
+        "label",
+        "label observations on a page in the browser, in rounds of DAgger",
+        epilog="--learner.NAME, --loop.NAME and --env.NAME are those of `rtg train dagger ENV`",
+    )
+    p.add_argument("run", metavar="RUN_OR_ENV", help="a run to go on with, or an environment to begin one in")
+    p.add_argument("--rounds", type=_whole, metavar="N", help="rounds in all (default 5)")
+    p.add_argument("--size", type=_whole, metavar="N", help="observations in a round (default 100)")
+    p.add_argument("--votes", type=_whole, metavar="N", help="labellers who answer each observation (default 1)")
+    p.add_argument("--num-envs", type=_whole, metavar="B", help="environments side by side (default 1)")
+    p.add_argument("--seed", type=_seed, default=None)
+    p.add_argument("--out", metavar="DIR", help="run folder (default runs/dagger-ENV-SEED-NUMBER)")
+    p.add_argument("--backend", choices=BACKENDS, metavar="BACKEND", help="auto, jax, gymnasium or envpool")
+    p.add_argument("--data", metavar="DATASET", help="demonstrations that the first policy learns from")
+    p.add_argument("--actions", metavar="NAME,NAME,...", help="what the page calls the actions")
+    p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="default 127.0.0.1: this machine alone")
+    p.add_argument("--port", type=_whole, default=8765, metavar="P", help="default 8765; 0 takes any free one")
+    p.add_argument("--token", metavar="TOKEN", help="what the address must have (default: a new one each time)")
+    p.add_argument(
+        "--pause", type=_number, default=5.0, metavar="SECONDS", help="for a last Undo before it learns (default 5)"
+    )
+    p.add_argument("--quiet", action="store_true", help="print nothing but the address")
+    p.add_argument("--json", action="store_true")
     p = command("figure", "redraw a figure or experiment of the notes")
     p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
     p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
@@ -350,6 +373,9 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
     elif arguments[0] == "solve" and not any(a in ("-h", "--help") for a in arguments):
         options, rest = table["solve"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("env",), "solve")
+    elif arguments[0] == "label" and not any(a in ("-h", "--help") for a in arguments):
+        options, rest = table["label"].parse_known_args(arguments[1:])
+        groups = _nested(rest, ("learner", "loop", "env"), "label")
     elif arguments[0] == "plan":
         if any(a in ("-h", "--help") for a in arguments):
             table["plan"].print_help()

@@ -327,6 +327,16 @@ class LabelQueue:
                 labels[index], known[index] = self._majority(said), True
             return labels, known
 
+    def settle(self) -> tuple[np.ndarray, np.ndarray]:
+        """Close the batch and give its `labels`, so that no answer comes between. Raises `ValueError` where there is none."""
+        with self._lock:
+            if not self._scores:
+                raise ValueError(
+                    "there is no label in this round yet, so there is nothing to learn from: answer at least one"
+                )
+            self._closed = True
+            return self.labels()
+
 
 def answer_by(
     function: Callable[[Any], Any], queue: LabelQueue, who: str = "script", at_most: int | None = None

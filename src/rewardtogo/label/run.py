@@ -221,12 +221,7 @@ class LabelledRun:
             raise ValueError(
                 f"all {self.rounds} rounds of {self.folder.path} are done: give more rounds (rtg label {self.folder.path} --rounds N)"
             )
-        flat, flat_known = batch.queue.labels()
-        if not flat_known.any():
-            raise ValueError(
-                "there is no label in this round yet, so there is nothing to learn from: answer at least one"
-            )
-        batch.queue.close()
+        flat, flat_known = batch.queue.settle()
         shape = batch.queries.transitions.reward.shape
         labels, known = _by_step(flat, shape), _by_step(flat_known, shape)
         _, learn_key = self._keys(batch.number - 1)
