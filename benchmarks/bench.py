@@ -38,6 +38,9 @@ PEERS = {
     "quantecon": "quantecon",
     "mdptoolbox": "pymdptoolbox",
     "mctx": "mctx",
+    "crocoddyl": "crocoddyl",
+    "torch": "PyTorch",
+    "imitation": "imitation",
 }
 ZOO = (
     "--preset none --num-envs 8 --loop.unroll 32 --learner.epochs 20 --learner.minibatches 1 --learner.gamma 0.98 "
@@ -57,7 +60,10 @@ def peer_python(peer: str) -> Path:
 
 def requirements(peer: str) -> list[Path]:
     """What is installed, in this order: PyTorch by itself first, so that nothing else decides which build it is."""
-    return [*([HERE / "peers" / "torch.txt"] if peer in ("sb3", "sbx") else []), HERE / "peers" / f"{peer}.txt"]
+    return [
+        *([HERE / "peers" / "torch.txt"] if peer in ("sb3", "sbx", "imitation") else []),
+        HERE / "peers" / f"{peer}.txt",
+    ]
 
 
 def peer_name(peer: str) -> str:
@@ -182,6 +188,12 @@ def ours(*arguments: Any, **more: Any) -> Contender:
     return Contender(lambda: [sys.executable, str(HERE / "ours.py"), *map(str, arguments)], **more)
 
 
+def script(name: str, *arguments: Any, peer: str | None = None) -> Contender:
+    """A measurement by a script beside this one, or by one of a peer's."""
+    python = lambda: sys.executable if peer is None else str(peer_python(peer))  # noqa: E731
+    return Contender(lambda: [python(), str(HERE / name), *map(str, arguments)], peer)
+
+
 def sb3(task: str, steps: int, library: str = "sb3") -> Contender:
     """A run of Stable-Baselines3 or SBX."""
     script = str(HERE / "peers" / "run_sb3.py")
@@ -191,8 +203,7 @@ def sb3(task: str, steps: int, library: str = "sb3") -> Contender:
 
 def rejax(task: str, steps: int) -> Contender:
     """A run of rejax."""
-    script = str(HERE / "peers" / "run_rejax.py")
-    return Contender(lambda: [str(peer_python("rejax")), script, task, "--steps", str(steps)], "rejax")
+    return script("peers/run_rejax.py", task, "--steps", steps, peer="rejax")
 
 
 # --- rows --------------------------------------------------------------------------------------------------------------------------
@@ -438,12 +449,9 @@ def memory(size: "Size") -> list[Row]:
 
 def planning(size: "Size") -> list[Row]:
     """Value iteration on a random decision process, beside tabular packages. Each stops by its own rule for the same ε; ours by both."""
-    script = str(HERE / "peers" / "run_dp.py")
-    peer = lambda name: Contender(lambda: [str(peer_python(name)), script, name], name)  # noqa: E731
     contenders = {
         "ours": ours("dp", "--repeats", size.laps),
-        "quantecon": peer("quantecon"),
-        "mdptoolbox": peer("mdptoolbox"),
+        **{name: script("peers/run_dp.py", name, peer=name) for name in ("quantecon", "mdptoolbox")},
     }
     found = measure(contenders, size.repeats)
     mine, rows = found["ours"], []
@@ -462,9 +470,8 @@ def planning(size: "Size") -> list[Row]:
 
 def mcts(size: "Size") -> list[Row]:
     """Tree search with a network, beside mctx: the same rules, network and positions."""
-    script = str(HERE / "peers" / "run_mctx.py")
-    command = lambda: [str(peer_python("mctx")), script, "--repeats", str(size.laps)]  # noqa: E731
-    found = measure({"ours": ours("mcts", "--repeats", size.laps), "mctx": Contender(command, "mctx")}, size.repeats)
+    other = script("peers/run_mctx.py", "--repeats", size.laps, peer="mctx")
+    found = measure({"ours": ours("mcts", "--repeats", size.laps), "mctx": other}, size.repeats)
     mine, other = found["ours"], found["mctx"]
     failed = "error" in mine or "error" in other
     ratio = None if failed else other["seconds"] / mine["seconds"]
@@ -472,6 +479,58 @@ def mcts(size: "Size") -> list[Row]:
     cell = lambda result: result.get("error") or f"{1e3 * result['seconds']:.1f} ms"  # noqa: E731
     met = None if "error" in other else ratio is not None and ratio >= 1
     return [Row(what, cell(mine), f"{peer_name('mctx')}: {cell(other)}", ratio, "≥ 1 x", met)]
+
+
+def faster(what: str, mine: Result, name: str, label: str, other: Result, theirs: str, least: float | None) -> Row:
+    """A row of seconds: `mine[name]` beside `other[theirs]`."""
+    cell = lambda result, key: result.get("error") or f"{1e3 * result[key]:.3g} ms"  # noqa: E731
+    failed = "error" in mine or "error" in other
+    ratio = None if failed else other[theirs] / mine[name]
+    met = None if least is None or ("error" in other and "error" not in mine) else ratio is not None and ratio >= least
+    return Row(what, cell(mine, name), f"{label}: {cell(other, theirs)}", ratio, f"≥ {least:g} x" if least else "", met)
+
+
+def control(size: "Size") -> list[Row]:
+    """Planning and control: iLQR beside crocoddyl, regulators beside NumPy, CEM beside PyTorch and the products it needs."""
+    rows, peer = [], peer_name("crocoddyl")
+    for name in ("pendulum", "cartpole", "quadrotor", "unicycle"):
+        both = measure(
+            {
+                "ours": script("control.py", "ilqr", name, "--repeats", size.laps),
+                "crocoddyl": script("peers/run_crocoddyl.py", name, "--repeats", size.laps, peer="crocoddyl"),
+            },
+            size.repeats,
+        )
+        mine, other = both["ours"], both["crocoddyl"]
+        if name == "unicycle":
+            what = "iLQR, unicycle, 40 steps, each of 64 problems in one program, beside a model in C++"
+            rows.append(faster(what, mine, "each", peer, other, "seconds", 1))
+        else:
+            rows.append(faster(f"iLQR, {name}, one problem", mine, "seconds", peer, other, "seconds", 1))
+    numbers = measure({"lqr": script("control.py", "lqr", "--repeats", size.laps)}, size.repeats)["lqr"]
+    what = "LQR, 12 states, 4 actions, 100 steps, 1,000 problems in one program, beside NumPy one after another"
+    rows.append(faster(what, numbers, "seconds", "NumPy", numbers, "numpy", 20))
+    both = measure(
+        {
+            "ours": script("control.py", "cem", "--repeats", size.laps),
+            "torch": script("peers/run_torch_cem.py", "--repeats", size.laps, peer="torch"),
+        },
+        size.repeats,
+    )
+    mine, other = both["ours"], both["torch"]
+    what = "CEM through 5 networks of 200x200, 500 candidates, 25 steps, 5 generations, a decision"
+    rows.append(faster(what, mine, "seconds", peer_name("torch"), other, "seconds", None))
+    rows.append(faster(f"{what}, against `jnp.dot` on the shapes it needs", mine, "seconds", "dots", mine, "dots", 0.5))
+    return rows
+
+
+def cloning(size: "Size") -> list[Row]:
+    """Behavioural cloning beside `imitation`."""
+    both = measure(
+        {"ours": script("cloning.py"), "imitation": script("peers/run_imitation.py", peer="imitation")}, size.repeats
+    )
+    what = "BC, 100,000 transitions of 17 numbers, 10 epochs, batches of 256, 256x256 tanh, compilation included"
+    return [faster(what, both["ours"], "seconds", peer_name("imitation"), both["imitation"], "seconds", 3)]
 
 
 GROUPS = {
@@ -489,6 +548,8 @@ GROUPS = {
     "memory": memory,
     "planning": planning,
     "mcts": mcts,
+    "control": control,
+    "cloning": cloning,
 }
 
 

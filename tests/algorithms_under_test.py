@@ -19,6 +19,7 @@ from rewardtogo.envs.opponents import RandomOpponent, Versus
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
+from rewardtogo.model_based import Dropout, MeanField
 from rewardtogo.planning import AlphaZero, CrossEntropy, Distill, RandomShooting, SelfPlay
 from rewardtogo.value.exploration import Boltzmann
 from rewardtogo.value.tabular_q import QLearning
@@ -122,6 +123,36 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     ),
     "mbrl-ts1": lambda: off_policy(
         rtg.ModelBased(sizes=(8,), members=2, planner=RandomShooting(samples=6), horizon=3, every=2, propagation="ts1")
+    ),
+    "mbrl-mean-field": lambda: continuous(
+        rtg.ModelBased(
+            sizes=(8,),
+            members=2,
+            posterior=MeanField(),
+            planner=RandomShooting(samples=6),
+            horizon=3,
+            objective="quantile",
+        )
+    ),
+    "mbrl-dropout": lambda: continuous(
+        rtg.ModelBased(
+            sizes=(8,),
+            members=2,
+            posterior=Dropout(),
+            planner=RandomShooting(samples=6),
+            horizon=3,
+            objective="lcb",
+            patience=2,
+        )
+    ),
+    "latent-mbrl": lambda: continuous(
+        rtg.LatentMBRL(
+            latent_size=3,
+            encoder_sizes=(8,),
+            sizes=(8,),
+            planner=CrossEntropy(samples=6, elites=2, iterations=2),
+            horizon=3,
+        )
     ),
     "fvi": lambda: off_policy(
         rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)

@@ -37,6 +37,7 @@ LAYERS: tuple[set[str], ...] = (
     {"loops"},
     CHAPTERS,
     {"runner"},
+    {"label"},
     {"figures", "cli"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
@@ -143,6 +144,30 @@ def test_imports_go_downwards():
                 allowed = other == room or LEVEL[other] < LEVEL[room] or (room, other) in SIDEWAYS
             if not allowed:
                 found.append(f"{name_of(path)}:{line} imports {other or 'the package itself'}")
+    fail(found)
+
+
+def test_only_the_command_knows_the_labelling_room():
+    fail(
+        [
+            f"{name_of(path)}:{line} imports {'.'.join(whole)}"
+            for path in FILES
+            if room_of(path) not in ("label", "cli")
+            for other, whole, line in rooms_imported(path)
+            if other == "label"
+        ]
+    )
+
+
+def test_the_labelling_room_stands_on_a_few_others():
+    below = {"label", "imitation", "runner", "envs", "core", "data", "catalogue"}
+    found = [
+        f"{name_of(path)}:{line} imports {other}"
+        for path in FILES
+        if room_of(path) == "label"
+        for other, _, line in rooms_imported(path)
+        if other not in below
+    ]
     fail(found)
 
 
@@ -385,6 +410,6 @@ def test_lazy_names_resolve_and_agree_with_the_typed_ones():
 )
 def test_nothing_imports_jax_that_does_not_need_it(program):
     code = f"import sys\ntry:\n    {program}\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
-    code += "heavy = {'jax', 'equinox', 'gymnasium', 'matplotlib'} & set(sys.modules)\nassert not heavy, heavy"
+    code += "heavy = {'jax', 'equinox', 'gymnasium', 'matplotlib', 'starlette', 'uvicorn'} & set(sys.modules)\nassert not heavy, heavy"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr

@@ -71,6 +71,7 @@ CLAIMS = [
     Claim("sac", "Pendulum-v1", 20_000, -200, seeds=4, items="6.28"),
     Claim("naf", "Pendulum-v1", 20_000, -200, seeds=4, items="6.24"),
     Claim("cem_q", "Pendulum-v1", 20_000, -200, seeds=4, items="6.23"),
+    Claim("latent_mbrl", "PixelPendulum", 8_000, -400, items="8.69", episodes=20),
 ]
 
 

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .loops.off_policy import OffPolicy as OffPolicy
     from .loops.offline import Offline as Offline
     from .loops.on_policy import OnPolicy as OnPolicy
+    from .model_based.latent import LatentMBRL as LatentMBRL
     from .model_based.mbrl import ModelBased as ModelBased
     from .nn.autoregressive import Autoregressive as Autoregressive
     from .nn.entries import Entries as Entries
@@ -103,6 +104,7 @@ _HOMES = {
     "loops.off_policy": "OffPolicy",
     "loops.offline": "Offline",
     "loops.on_policy": "OnPolicy",
+    "model_based.latent": "LatentMBRL",
     "model_based.mbrl": "ModelBased",
     "nn.autoregressive": "Autoregressive",
     "nn.entries": "Entries",
@@ -141,6 +143,7 @@ _ROOMS = (
     "exact",
     "figures",
     "imitation",
+    "label",
     "loops",
     "model_based",
     "nn",

@@ -31,7 +31,12 @@ ANY = ("discrete", "multi_discrete", "multi_binary", "box")
 _VANILLA = "rewardtogo.policy_gradient.vanilla:PolicyGradient"
 _DQN = "rewardtogo.value.dqn:DQN"
 _ONE_STEP = {"returns": "n_step", "n_steps": 1, "value_first": True}
-_ONE_MODEL = {"members": 1, "probabilistic": False, "bootstrap": False, "propagation": "mean"}
+_ONE_MODEL = {
+    "members": 1,
+    "probabilistic": False,
+    "posterior": {"class": "bootstrap", "resample": False},
+    "propagation": "mean",
+}
 _EVERY_STEP = {"unroll": 1, "batch_size": 256, "replay": {"capacity": 1_000_000}}
 
 ALGORITHMS: dict[str, Row] = {
@@ -207,6 +212,26 @@ ALGORITHMS: dict[str, Row] = {
                     {},
                 ),
             )
+        ),
+        Row(
+            "latent_mbrl",
+            "rewardtogo.model_based.latent:LatentMBRL",
+            "off_policy",
+            "8",
+            "Alg 22",
+            ("discrete", "multi_discrete", "box"),
+            "learn a latent state of pictures, with its dynamics and rewards, and replan in it at every step",
+            {},
+            {
+                "unroll": 50,
+                "updates": 100,
+                "batch_size": 64,
+                "length": 6,
+                "warm_up": 400,
+                "replay": {"capacity": 50_000},
+            },
+            1,
+            2,
         ),
         Row(
             "npg",
@@ -505,6 +530,8 @@ ENVIRONMENTS: dict[str, str] = {
     "LastTwo": "answer the XOR of the last two observations: needs a memory; the optimum is 20",
     "Drone": "pass a tree left or right: a Gaussian goes in between; the optimum is 1",
     "Tightrope": "two states: the worst problem for a copy of an expert; the optimum is 50",
+    "PixelPendulum": "Pendulum as pictures of 16 x 16 pixels, the last two",
+    "PixelPendulumOneFrame": "the same with the last picture alone: needs a memory",
     "TicTacToe": "tic-tac-toe against random moves, either side begins; tells which moves are allowed",
     "TicTacToePerfect": "the same against a player without a mistake: the optimum is 0",
     "ConnectFour": "Connect Four against random moves",

@@ -246,6 +246,8 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "normalise_observations": True,
         },
     },
+    # Three minutes on two cores.
+    ("latent_mbrl", "PixelPendulum"): {"steps": 8_000},
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},
     ("trpo", "Pendulum-v1"): {
         "steps": 300_000,

@@ -55,8 +55,8 @@ def act(algorithm: DAgger, state, key):
 
 
 @jax.jit
-def learn(algorithm: DAgger, state, queries, labels, key):
-    return algorithm.learn(state, queries, labels, key)
+def learn(algorithm: DAgger, state, queries, labels, key, known=None):
+    return algorithm.learn(state, queries, labels, key, known)
 
 
 @jax.jit
@@ -108,6 +108,29 @@ def test_labels_from_outside_give_the_same(key, item):
         check(different, "==", 0, "arrays of the state that differ after three rounds")
     with pytest.raises(ValueError, match="there is no expert to ask: use act and learn"):
         asked.step(states[1], key)
+
+
+def test_observations_without_a_label_are_left_out(key):
+    """The data has the labelled rows in order, sequences end at the gaps, and mistakes are counted where somebody answered."""
+    algorithm = small(None, beta=0.0)
+    state, queries, _ = act(algorithm, start(algorithm, key), key)
+    labels = np.asarray(jax.vmap(jax.vmap(balance))(queries.observations))
+    known = np.ones((8, 2), bool)
+    known[3, 0] = known[0, 1] = known[7, 1] = False
+    after, metrics = learn(algorithm, state, queries, labels, key, known)
+    kept = [(t, b) for b in range(2) for t in range(8) if known[t, b]]
+    assert int(after.written) == 13 and float(metrics["labels"]) == 13.0
+    for row, (t, b) in enumerate(kept):
+        assert np.array_equal(after.data.observation[row], queries.observations[t, b])
+        assert int(after.data.action[row]) == labels[t, b]
+        cut = t == 7 or not known[t + 1, b]
+        assert bool(after.data.truncated[row] | after.data.terminated[row]) == cut
+    assert not np.any(np.asarray(after.data.observation[13:]))
+    wrong = np.asarray(queries.own) != labels
+    assert float(metrics["mistakes"]) == pytest.approx(wrong[known].mean())
+    # Where nobody passed, it makes no difference whether that is said.
+    whole, said = learn(algorithm, state, queries, labels, key), np.ones((8, 2), bool)
+    assert same(whole, learn(algorithm, state, queries, labels, key, said))
 
 
 def test_the_expert_acts_with_probability_beta(key):

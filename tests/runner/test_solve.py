@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rewardtogo.cli.main import SOLVERS, main
+from rewardtogo.envs.toy_text import gymnasium_table
 from rewardtogo.runner.solve import SWEEPING, report, solve_by_name
 
 
@@ -46,6 +47,10 @@ def test_a_taxi_has_two_boards_and_a_discount():
     found = solve_by_name("Taxi-v4", "modified_policy_iteration", gamma=0.9)
     text = report(found)
     assert text.count("the passenger") == 2 and "discount 0.9" in text and " P" in text and " D" in text
+    # No way leads across a wall, and a way leads across every other side.
+    P, board = gymnasium_table("Taxi-v4").P, found.panels[0]
+    walls = {(r, c) for r in range(5) for c in range(4) if P[board.states[r, c]][2][0][1] == board.states[r, c]}
+    assert board.walls == walls and len(walls) == 6 and text.count("|") == 12
     best = [solve_by_name("Taxi-v4", m, gamma=0.9).expected_return for m in ("value_iteration", "policy_iteration")]
     assert np.ptp([*best, found.expected_return]) <= 1e-8
     assert set(SWEEPING) < set(SOLVERS)

@@ -20,6 +20,7 @@ from .opponents import PerfectOpponent as PerfectOpponent
 from .opponents import RandomOpponent as RandomOpponent
 from .opponents import Versus as Versus
 from .pendulum import Pendulum as Pendulum
+from .pixel_pendulum import PixelPendulum as PixelPendulum
 from .registry import make as make
 from .reward_wrappers import NormalizeReward as NormalizeReward
 from .reward_wrappers import RewardFunction as RewardFunction

@@ -18,6 +18,7 @@ from .imitation_problems import Braking, Drone, Lane, LastTwo
 from .mountain_car import MountainCar, MountainCarContinuous
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
+from .pixel_pendulum import PixelPendulum
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
 from .tabular import TabularEnv
@@ -25,7 +26,7 @@ from .tabular_problems import tightrope
 from .time_limit import TimeLimit
 from .toy_text import TABULAR, has_twin, toy_text
 from .vectorize import vectorize
-from .wrappers import MaskObservation
+from .wrappers import FrameStack, MaskObservation
 
 Backend = Literal["auto", "jax", "gymnasium", "envpool"]
 BACKENDS = ("auto", "jax", "gymnasium", "envpool")
@@ -45,6 +46,8 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "LastTwo": LastTwo,
     "Drone": Drone,
     "Tightrope": lambda: TabularEnv(tightrope()),
+    "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
+    "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
     "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),

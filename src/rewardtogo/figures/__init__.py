@@ -49,6 +49,10 @@ FIGURES = {
         "fisher_ellipse",
         "the ball of gradient ascent and the ellipse of the natural gradient, with the KL along both",
     ),
+    "8.3": (
+        "latent_model",
+        "the graphical model with latent states, its edges read from the networks that are planned in",
+    ),
 }
 """Number in the notes: the module here that draws it, and what it shows."""
 

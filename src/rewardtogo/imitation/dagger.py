@@ -27,7 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..core import (
     MASK,
@@ -221,7 +221,9 @@ class DAgger(Algorithm, Configured):
 
     def step(self, state: DAggerState, key: PRNGKey) -> tuple[DAggerState, tuple[dict[str, jax.Array], Episodes]]:
         if self.expert is None:
-            raise ValueError("there is no expert to ask: use act and learn, with labels from wherever they come")
+            raise ValueError(
+                "there is no expert to ask: use act and learn, with labels from wherever they come; a person gives them with `rtg label`"
+            )
         act_key, learn_key = jax.random.split(key)
         state, queries, episodes = self.act(state, act_key)
         state, metrics = self.learn(state, queries, queries.labels, learn_key)
@@ -237,18 +239,26 @@ class DAgger(Algorithm, Configured):
         return dataclasses.replace(state, actor=actor), queries, episodes
 
     def learn(
-        self, state: DAggerState, queries: Queries, labels: Action, key: PRNGKey
+        self,
+        state: DAggerState,
+        queries: Queries,
+        labels: Action,
+        key: PRNGKey,
+        known: Bool[Array, "T B"] | None = None,
     ) -> tuple[DAggerState, dict[str, Array]]:
-        """The second half: judge the policy by its labels `[T, B]`, add them to the data, fit the next policy to all of it."""
+        """The second half: judge the policy by its labels `[T, B]`, add them to the data, fit the next policy to all of it.
+
+        `known` says which of the labels there are, at least one; the other observations are left out. None where nobody passed.
+        """
         spec = self.spec.action
         labels = spec.clip(jnp.asarray(labels, spec.dtype))
-        mistakes = _mistakes(self.spec, queries.own, labels)
+        mistakes = _mistakes(self.spec, queries.own, labels, known)
         # The very first policy was fitted to nothing.
         judged = (state.rounds > 0) | (self._given > 0)
         better = judged & (mistakes <= state.best_mistakes)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), state.learner, state.best)
         state = dataclasses.replace(
-            self._aggregated(state, queries.transitions, labels),
+            self._aggregated(state, queries.transitions, labels, known),
             best=best,
             best_mistakes=jnp.where(better, mistakes, state.best_mistakes),
             rounds=state.rounds + 1,
@@ -285,15 +295,21 @@ class DAgger(Algorithm, Configured):
             seen, many(self.spec.action.zeros()), jnp.zeros(rows), never, never, many(self.spec.observation.zeros()), {}
         )
 
-    def _aggregated(self, state: DAggerState, t: Transition, labels: Action) -> DAggerState:
-        """The data with the rows of a round, one environment after the other; a sequence ends where the next one begins."""
-        last = (jnp.arange(self.unroll) == self.unroll - 1)[:, None]
+    def _aggregated(self, state: DAggerState, t: Transition, labels: Action, known: Array | None) -> DAggerState:
+        """The data with the rows of a round, one environment after the other; a sequence ends where the next one begins, and at a gap."""
+        last = jnp.broadcast_to((jnp.arange(self.unroll) == self.unroll - 1)[:, None], t.reward.shape)
+        if known is not None:
+            last = last | ~jnp.concatenate([known[1:], known[-1:]])
         t = dataclasses.replace(t, action=labels, truncated=t.truncated | (last & ~t.terminated))
-        rows = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), t)
+        in_a_row = lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:])  # noqa: E731
+        rows = jax.tree.map(in_a_row, t)
         capacity = len(state.data.reward)
-        place = (state.written + jnp.arange(len(rows.reward))) % capacity
-        data = jax.tree.map(lambda room, new: room.at[place].set(new), state.data, rows)
-        return dataclasses.replace(state, data=data, written=state.written + len(rows.reward))
+        kept = jnp.ones(len(rows.reward), bool) if known is None else in_a_row(known)
+        count = jnp.cumsum(kept.astype(jnp.int32))
+        # What has no label gets a place that does not exist.
+        place = jnp.where(kept, (state.written + count - 1) % capacity, capacity)
+        data = jax.tree.map(lambda room, new: room.at[place].set(new, mode="drop"), state.data, rows)
+        return dataclasses.replace(state, data=data, written=state.written + count[-1])
 
     def _fit(self, state: DAggerState, key: PRNGKey) -> tuple[State, dict[str, Array]]:
         fresh_key, loop_key = jax.random.split(key)
@@ -315,12 +331,16 @@ def _labelled(t: Transition) -> Transition:
     return dataclasses.replace(t, action=t.extras.get(EXPERT, t.action), extras={})
 
 
-def _mistakes(spec: EnvSpec, own: Action, labels: Action) -> Float[Array, ""]:
+def _mistakes(spec: EnvSpec, own: Action, labels: Action, known: Array | None) -> Float[Array, ""]:
     """Share of entries of the learner's choices that are not the expert's; in boxes the mean squared distance, in half boxes."""
     if spec.action.kind == "box":
         unit: np.ndarray = half_width(spec.action)[None, None]
-        return jnp.square((spec.action.clip(own) - labels) / unit).mean()
-    return (own != labels).astype(jnp.float32).mean()
+        wrong = jnp.square((spec.action.clip(own) - labels) / unit)
+    else:
+        wrong = (own != labels).astype(jnp.float32)
+    if known is None:
+        return wrong.mean()
+    return wrong.mean(where=known.reshape(known.shape + (1,) * (wrong.ndim - 2)))
 
 
 def _spread(spec: EnvSpec, mistakes: Array) -> Array:

@@ -1,6 +1,21 @@
 """Reinforcement learning with learned models (chapter 8, section 8.3)."""
 
 from .ensembles import Ensemble as Ensemble
-from .ensembles import LearnedModel as LearnedModel
 from .ensembles import Prediction as Prediction
+from .ensembles import aleatoric as aleatoric
+from .ensembles import epistemic as epistemic
+from .ensembles import output_entropy as output_entropy
+from .ensembles import total_variance as total_variance
+from .fit import Regression as Regression
+from .fit import fit as fit
+from .fit import fit_model as fit_model
+from .learned import LearnedModel as LearnedModel
+from .learned import Objective as Objective
+from .latent import LatentMBRL as LatentMBRL
+from .latent import LatentModel as LatentModel
+from .latent_linear import fit_linear_gaussian as fit_linear_gaussian
 from .mbrl import ModelBased as ModelBased
+from .posteriors import Bootstrap as Bootstrap
+from .posteriors import Dropout as Dropout
+from .posteriors import MeanField as MeanField
+from .posteriors import Posterior as Posterior

@@ -4,6 +4,11 @@ from .advantages import gae as gae
 from .advantages import gae_weights as gae_weights
 from .advantages import n_step_advantages as n_step_advantages
 from .advantages import normalise as normalise
+from .bayesian import LinearPrediction as LinearPrediction
+from .bayesian import NormalInverseGamma as NormalInverseGamma
+from .bayesian import StudentT as StudentT
+from .bayesian import linear_posterior as linear_posterior
+from .bayesian import linear_prediction as linear_prediction
 from .distributional import categorical_projection as categorical_projection
 from .distributional import quantile_huber as quantile_huber
 from .distributional import quantile_levels as quantile_levels
@@ -30,6 +35,12 @@ from .importance import importance_weights as importance_weights
 from .importance import log_ratio as log_ratio
 from .importance import normalised_weights as normalised_weights
 from .importance import self_normalised_mean as self_normalised_mean
+from .kalman import Filtered as Filtered
+from .kalman import LinearGaussian as LinearGaussian
+from .kalman import Smoothed as Smoothed
+from .kalman import kalman_filter as kalman_filter
+from .kalman import kalman_smoother as kalman_smoother
+from .kalman import simulate_linear as simulate_linear
 from .linalg import conjugate_gradients as conjugate_gradients
 from .linalg import inner as inner
 from .mixtures import GaussianMixture as GaussianMixture

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from .linear_quadratic import lqr as lqr
     from .linear_quadratic import lqr_infinite as lqr_infinite
     from .linear_quadratic import riccati as riccati
+    from .linear_quadratic_gaussian import Estimating as Estimating
+    from .linear_quadratic_gaussian import lqg as lqg
     from .mpc import ILQR as ILQR
     from .mpc import MPC as MPC
     from .mpc import Collocation as Collocation
@@ -68,6 +70,7 @@ _HOMES = {
     "identification": "identify",
     "iterated_lqr": "ilqr",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
+    "linear_quadratic_gaussian": "Estimating lqg",
     "mpc": "Collocation CrossEntropy GradientShooting ILQR MPC NewtonShooting PathIntegral Planner RandomShooting",
     "open_loop": "best_open_loop open_loop_return open_loop_returns",
     "problem": "FunctionProblem ModelProblem Plan Problem box plan_of rollout total_cost why",

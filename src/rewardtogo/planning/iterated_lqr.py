@@ -15,7 +15,7 @@ $\sum_i v_{t+1,i} \nabla^2 f_{t,i}$ (item 8.39).
 
 As the notes print it (the full step, always) it diverges in practice (erratum E8.8). Here (Tassa, Erez and Todorov 2012):
 
-- $\alpha$ is the first of 1, 1/2, 1/4, ... whose cost falls by a share of what the model promises; all are tried side by side.
+- $\alpha$ is the first of 1, 1/2, 1/4, ... whose cost falls by a share of what the model promises.
 - $\mu I$ is added to $Q_{uu}$, and grows while that is not positive definite or no $\alpha$ will do, and falls again after.
 - With bounds on the actions $k_t$ solves the box-constrained quadratic programme, and rows of $K_t$ whose action rests on its bound are 0
   (Tassa,
@@ -33,11 +33,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..core import Solution
-from ..ops.linalg import definite_solve
+from ..ops.linalg import definite_solve, small_product
 from .flat import FlatProblem, finished, require_finite
 from .problem import CONVERGED, LINE_SEARCH_FAILED, MAX_ITERS, NOT_POSITIVE_DEFINITE, Problem
 
-ALPHAS = tuple(0.5**i for i in range(11))
+STEP_LENGTHS = 11
+"""1, 1/2, 1/4, ...: how many are tried."""
 LEAST_MU, MOST_MU = 1e-6, 1e10
 ENOUGH = 1e-4
 """The share of the promised fall of the cost that a step must bring."""
@@ -106,9 +107,8 @@ def backward(
     def step(loop: tuple[Array, ...], now: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         V, v, costate = loop
         F, f, c, C, point, action, t = now
-        VF = V @ F
         ahead = V @ f + v
-        Q, q = C + F.T @ VF, c + F.T @ ahead
+        Q, q = C + small_product(F.T, small_product(V, F)), c + F.T @ ahead
         if ddp:
             bend = jax.hessian(lambda z: problem.step(z[:x], z[x:], t)[0] @ ahead)(jnp.concatenate([point, action]))
             Q = Q + bend
@@ -119,7 +119,7 @@ def backward(
         else:
             solved, pivot = definite_solve(held, jnp.concatenate([q[x:, None], Q_ux], 1))
             k, K = -solved[:, 0], -solved[:, 1:]
-        half = 0.5 * Q[:x, :x] + (Q_ux.T + 0.5 * K.T @ Q_uu) @ K
+        half = 0.5 * Q[:x, :x] + small_product(Q_ux.T + 0.5 * small_product(K.T, Q_uu), K)
         V = half + half.T
         v = q[:x] + Q_ux.T @ k + K.T @ (q[x:] + Q_uu @ k)
         adjoint = c + F.T @ costate
@@ -201,6 +201,8 @@ def _search(
 ) -> Search:
     low, high = map(jnp.asarray, problem.bounds())
     running = -1
+    # What is lost in a sum of so many costs: a fall that is promised to be less cannot be seen.
+    rounding = 8 * float(jnp.finfo(x0.dtype).eps) * problem.horizon**0.5
 
     def iterate(s: Search) -> Search:
         sweep = backward(problem, expand(problem, s.states, s.actions), s.states, s.actions, s.mu, ddp)
@@ -209,21 +211,31 @@ def _search(
             choose = lambda x, now: jnp.clip(now[1] + alpha * now[3] + now[2] @ (x - now[0]), low, high)  # noqa: E731
             return problem.follow(x0, choose, (s.states[:-1], s.actions, sweep.K, sweep.k))
 
-        alphas = jnp.asarray(ALPHAS, s.cost.dtype)
-        states, tried, costs = jax.vmap(forward)(alphas)
-        promised = -(alphas * sweep.slope + 0.5 * alphas**2 * sweep.curvature)
-        good = (s.cost - costs >= ENOUGH * promised) & (promised > 0) & jnp.isfinite(costs) & (sweep.bad_step < 0)
-        first = jnp.argmax(good)
-        better = good[first]
+        def enough(alpha: Array, cost: Array) -> Array:
+            promised = -(alpha * sweep.slope + 0.5 * alpha**2 * sweep.curvature)
+            return (s.cost - cost >= ENOUGH * promised) & (promised > 0) & jnp.isfinite(cost) & (sweep.bad_step < 0)
+
         # A bounded action may rest where the gradient points outwards: what counts is the part that can be followed.
         stuck = ((s.actions <= low[None]) & (sweep.gradient > 0)) | ((s.actions >= high[None]) & (sweep.gradient < 0))
         gradient = jnp.max(jnp.abs(jnp.where(stuck, 0.0, sweep.gradient)))
-        # Rounding of the cost is all that is left: neither better nor worse.
-        fall = jnp.where(better, s.cost - costs[first], 0.0)
         small = 1.0 + jnp.abs(s.cost)
         flat = (sweep.bad_step < 0) & (
-            (-sweep.slope <= tolerance * small) & (s.mu <= 1e-3) | (gradient <= 1e-3 * tolerance * small)
+            (-sweep.slope <= jnp.maximum(tolerance, rounding) * small) & (s.mu <= 1e-3)
+            | (gradient <= 1e-3 * tolerance * small)
         )
+        # Where the model promises nothing that could be seen, the full step decides.
+        worth = ~flat & (sweep.bad_step < 0) & (s.reason == running)
+
+        def shorten(loop: tuple[Array, ...]) -> tuple[Array, ...]:
+            alpha = 0.5 ** loop[0].astype(s.cost.dtype)
+            states, tried, cost = forward(alpha)
+            return loop[0] + 1, states, tried, cost, enough(alpha, cost)
+
+        unfinished = lambda loop: (loop[0] == 0) | (worth & ~loop[-1] & (loop[0] < STEP_LENGTHS))  # noqa: E731
+        loop = (jnp.zeros((), jnp.int32), s.states, s.actions, s.cost, jnp.zeros((), bool))
+        _, states, tried, cost, better = jax.lax.while_loop(unfinished, shorten, loop)
+        # Rounding of the cost is all that is left: neither better nor worse.
+        fall = jnp.where(better, s.cost - cost, 0.0)
         growth = jnp.where(better, jnp.minimum(s.growth / 2.0, 0.5), jnp.maximum(s.growth * 2.0, 2.0))
         mu = jnp.where(better, s.mu * growth, jnp.maximum(s.mu * growth, LEAST_MU))
         mu = jnp.where(mu < LEAST_MU, 0.0, mu)
@@ -233,10 +245,10 @@ def _search(
             jnp.where(mu > MOST_MU, jnp.where(sweep.bad_step >= 0, NOT_POSITIVE_DEFINITE, LINE_SEARCH_FAILED), running),
         )
         keep = lambda new, old: jnp.where(better, new, old)  # noqa: E731
-        cost = keep(costs[first], s.cost)
+        cost = keep(cost, s.cost)
         return Search(
-            keep(states[first], s.states),
-            keep(tried[first], s.actions),
+            keep(states, s.states),
+            keep(tried, s.actions),
             cost,
             jnp.where(sweep.bad_step < 0, sweep.K, s.gains),
             mu,

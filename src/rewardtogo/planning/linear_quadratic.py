@@ -33,7 +33,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, ScalarLike
 
 from ..core import Action, Carry, Observation, Policy, PRNGKey, Solution, Spec, State
-from ..ops.linalg import definite_solve
+from ..ops.linalg import definite_solve, small_product
 from .problem import CONVERGED, NOT_FINITE, NOT_POSITIVE_DEFINITE, Problem, box, plan_of, whole
 
 
@@ -229,14 +229,13 @@ def backup(
 ) -> Backup:
     """From the value of the next step to the gains and the value of this one; `pivot` is positive where Q_uu is positive definite."""
     x = len(F)
-    VF = V @ F
-    Q = C + F.T @ VF
+    Q = C + small_product(F.T, small_product(V, F))
     q = c + F.T @ (V @ f + v)
     Q_xx, Q_ux, Q_uu = Q[:x, :x], Q[x:, :x], Q[x:, x:]
     solved, pivot = definite_solve(Q_uu, jnp.concatenate([Q_ux, q[x:, None]], 1))
     K, k = -solved[:, :x], -solved[:, x]
     # Symmetric to the last bit, or rounding grows from step to step.
-    half = 0.5 * Q_xx + (Q_ux.T + 0.5 * K.T @ Q_uu) @ K
+    half = 0.5 * Q_xx + small_product(Q_ux.T + 0.5 * small_product(K.T, Q_uu), K)
     V_new = half + half.T
     v_new = q[:x] + Q_ux.T @ k + K.T @ (q[x:] + Q_uu @ k)
     added = 0.5 * f @ V @ f + f @ v + (0.5 * Q_uu @ k + q[x:]) @ k

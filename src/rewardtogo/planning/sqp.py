@@ -33,7 +33,7 @@ from jaxtyping import Array, Float, Int
 
 from ..core import Action, PRNGKey, Solution, Spec, State
 from .flat import FlatProblem, finished, require_finite
-from .iterated_lqr import ALPHAS, ENOUGH, LEAST_MU, MOST_MU, backward, expand
+from .iterated_lqr import ENOUGH, LEAST_MU, MOST_MU, STEP_LENGTHS, backward, expand
 from .problem import CONVERGED, LINE_SEARCH_FAILED, MAX_ITERS, NOT_POSITIVE_DEFINITE, Problem
 
 TO_THE_BOUND = 0.99
@@ -139,7 +139,7 @@ def _programme(
 
         room = jnp.where(du > 0, high[None] - s.actions, s.actions - low[None])
         furthest = jnp.min(jnp.where(du == 0, jnp.inf, TO_THE_BOUND * room / jnp.abs(du)))
-        alphas = jnp.asarray(ALPHAS, s.cost.dtype) * jnp.minimum(1.0, furthest)
+        alphas = 0.5 ** jnp.arange(STEP_LENGTHS, dtype=s.cost.dtype) * jnp.minimum(1.0, furthest)
         states_, actions_, costs, defects = jax.vmap(tried)(alphas)
         merit, merits = s.cost + penalty * s.defect, costs + penalty * defects
         promised = alphas * (penalty * s.defect - slope)

@@ -19,6 +19,7 @@ from ..core import Schedule
 from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..envs.simulator import Simulator
+from ..model_based.posteriors import Bootstrap, Dropout, MeanField
 from ..nn import CNN, GRU, LSTM, MLP, Autoregressive, Entries, Latent, Mixture, Network, Stacked, Standard
 from ..ops.schedules import parse_schedule, to_text
 from ..planning.mpc import (
@@ -41,11 +42,12 @@ _NETWORKS = (MLP, CNN, GRU, LSTM, Stacked, Entries)
 _HEADS = (Standard, Mixture, Autoregressive, Latent)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
+_POSTERIORS = (Bootstrap, MeanField, Dropout)
 _PLANNERS = (RandomShooting, CrossEntropy, PathIntegral, GradientShooting, NewtonShooting, ILQR, Collocation)
 PARTS: dict[str, type] = {
-    c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES, *_PLANNERS, Simulator)
+    c.__name__.lower(): c for c in (*_NETWORKS, *_HEADS, *_MEMORIES, *_CHOICES, *_POSTERIORS, *_PLANNERS, Simulator)
 }
-PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay}
+PARTS |= {"uniform": UniformReplay, "prioritised": PrioritisedReplay, "mean_field": MeanField}
 
 
 KINDS: dict[Any, str] = {bool: "true or false", int: "a whole number", str: "a name"}

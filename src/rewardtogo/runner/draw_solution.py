@@ -30,6 +30,8 @@ def draw_solution(found: Solved, out: str | Path) -> Path:
                 colour = "black" if not value or level > 0.6 else "white"
                 axes.text(c, r - 0.16 if value else r, symbol, ha="center", va="center", color=colour, fontsize=13)
                 axes.text(c, r + 0.27, value, ha="center", va="center", color=colour, fontsize=7)
+        for r, c in panel.walls:
+            axes.plot([c + 0.5, c + 0.5], [r - 0.5, r + 0.5], color="black", linewidth=4, solid_capstyle="butt")
         axes.set_xticks(np.arange(columns + 1) - 0.5, [])
         axes.set_yticks(np.arange(rows + 1) - 0.5, [])
         axes.grid(color="white", linewidth=1)

@@ -9,6 +9,9 @@ from ..imitation.experts import as_expert, require_expert
 from .config import resolve
 from .policy import load
 
+PERSON = "person"
+"""The name of the expert who answers between two rounds, by way of files: `rtg label`."""
+
 
 def expert_of(source: Any, spec: EnvSpec) -> Policy:
     """The expert that is named or given, checked against the spaces it is to act in.

@@ -25,7 +25,7 @@ from ..planning.tree_search import Numbered
 from .config import build, describe, merge, override, resolve
 from .engine import iterations_for, steps_after
 from .evaluate import lanes_for
-from .experts import expert_of, is_code
+from .experts import PERSON, expert_of, is_code
 from .policy import restore_learner
 
 DEFAULT_STEPS = 100_000
@@ -215,7 +215,7 @@ def _imitation(name: str, expert: Any, data: Any, env: VectorEnv) -> dict[str, A
             f"{name} learns from an expert's answers: name one with --expert RUN or --expert module:function"
         )
     return {
-        "expert": expert_of(expert, env_spec(env)),
+        "expert": None if expert == PERSON else expert_of(expert, env_spec(env)),
         "demonstrations": None if data is None else _dataset(data),
     }
 

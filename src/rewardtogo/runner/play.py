@@ -73,7 +73,7 @@ def film_of(
 ) -> tuple[Path, float, int]:
     """An episode of a policy as a film. `described`: the environment as `config.json` has it."""
     require_film(path)
-    drawn = _drawable(described, env)
+    drawn = drawable(described, env)
     try:
         with _Film(path, float(drawn.metadata.get("render_fps") or 30)) as film:
             total, length = _episode(drawn, policy, seed, stochastic, film)
@@ -83,11 +83,16 @@ def film_of(
     return path, total, length
 
 
-def _drawable(described: dict[str, Any], env: Any) -> gymnasium.Env:
-    """Gymnasium's environment, ready to be drawn."""
+def without_a_screen() -> None:
+    """Let environments draw into memory on a machine without a display."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def drawable(described: dict[str, Any], env: Any = None) -> gymnasium.Env:
+    """Gymnasium's environment, ready to be drawn. Raises `ValueError` where there is none, or it has no picture."""
+    without_a_screen()
     if isinstance(env, gymnasium.Env):
         return env
     name = described["id"]

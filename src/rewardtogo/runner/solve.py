@@ -32,11 +32,12 @@ SWEEPING: dict[str, Sweeping] = {
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """A board: which state each square is (-1: none), and a letter for it where it has one."""
+    """A board: which state each square is (-1: none), a letter for it where it has one, and the squares with a wall on their right."""
 
     title: str
     states: Int[np.ndarray, "R C"]
     letters: tuple[str, ...]
+    walls: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +124,11 @@ def _layout(env: Any) -> tuple[tuple[Panel, ...], tuple[str, str]]:
     if kind == "TaxiEnv":
         corner = {(0, 0): "R", (0, 4): "G", (4, 0): "Y", (4, 3): "B"}
         letters = tuple("".join(corner.get((r, c), " ") for c in range(5)) for r in range(5))
+        # Its drawing has a frame around it, and a column between any two.
+        walls = frozenset((r, c) for r in range(5) for c in range(4) if env.desc[r + 1, 2 * c + 2] == b"|")
         states = lambda at: np.array([[env.encode(r, c, at, 1) for c in range(5)] for r in range(5)])  # noqa: E731
-        waiting = Panel("the passenger waits at R and wants to G", states(0), letters)
-        inside = Panel("the passenger is in the taxi and wants to G", states(4), letters)
+        waiting = Panel("the passenger waits at R and wants to G", states(0), letters, walls)
+        inside = Panel("the passenger is in the taxi and wants to G", states(4), letters, walls)
         return (waiting, inside), ("↓↑→←PD", "v^><PD")
     return (), ("", "")
 
@@ -166,7 +169,11 @@ def _board(found: Solved, panel: Panel, arrows: bool) -> list[str]:
     rows, columns = panel.states.shape
     cells = [[" ".join(c for c in cell(found, panel, r, k, arrows) if c) for k in range(columns)] for r in range(rows)]
     width = max(len(c) for row in cells for c in row)
-    return ["  ".join(c.rjust(width) for c in row) for row in cells]
+    lines = []
+    for r, row in enumerate(cells):
+        between = [" |" if (r, k) in panel.walls else "  " for k in range(columns - 1)]
+        lines.append("".join(c.rjust(width) + gap for c, gap in zip(row, [*between, ""], strict=True)))
+    return lines
 
 
 def _rows(found: Solved, most: int = 20) -> list[str]:

@@ -269,7 +269,7 @@ class Session:
                         f"interrupted after {moment.env_steps} steps; a checkpoint is written: rtg resume {self.folders[0].path}"
                     )
                 reporter.close()
-                return self._finish(moment, reporter)
+                return self.finish(moment, reporter)
         finally:
             reporter.close()
             ahead.join()
@@ -305,7 +305,7 @@ class Session:
         files = [folder.path / "evaluation.json" for folder in self.folders]
         return all(file.exists() and read_json(file).get("env_steps") == wanted for file in files)
 
-    def _finish(self, moment: Moment, reporter: Reporter) -> list[Run]:
+    def finish(self, moment: Moment, reporter: Reporter) -> list[Run]:
         """The last evaluation, the curve, and `evaluation.json`."""
         from .plot import draw_curves  # takes half a second, which `_prepare` has spent meanwhile
 
