@@ -69,7 +69,7 @@ def ask(seed: int = 0, rounds: int = ROUNDS) -> Float[np.ndarray, "R"]:
         rounds
     )
     step = jax.jit(lambda state, key: algorithm.step(state, key)[0])
-    state, evaluate, found = jax.jit(algorithm.init)(key), Evaluator(vectorize(Braking(), 100), 100), []
+    state, evaluate, found = jax.jit(lambda k: algorithm.init(k))(key), Evaluator(vectorize(Braking(), 100), 100), []
     for i in range(rounds):
         state = step(state, jax.random.fold_in(key, i))
         found.append(float(evaluate(LEARNER.policy(state.learner, False), key)[0].mean()))

@@ -78,10 +78,10 @@ def expert_flights(seed: int = 0) -> Flights:
 def fly(head: HeadRecipe, seed: int = 0) -> Flights:
     """Learns from the expert's flights with this head, and flies past other trees by sampling."""
     key = jax.random.key(seed)
-    rate = 0.05 if isinstance(head, Latent) else 5e-3
-    learner = BC(network=MLP(32), head=head, learning_rate=Linear(rate, 0.0))
-    algorithm = Offline(demonstrations(key), learner, batch_size=128, updates=20)
-    policy = algorithm.policy(run(algorithm, key, 40)[0], explore=True)
+    latent = isinstance(head, Latent)
+    learner = BC(network=MLP(32), head=head, learning_rate=Linear(0.03 if latent else 5e-3, 0.0))
+    algorithm = Offline(demonstrations(key), learner, batch_size=256 if latent else 128, updates=20)
+    policy = algorithm.policy(run(algorithm, key, 80 if latent else 40)[0], explore=True)
     reset_keys, act_keys = jax.random.split(jax.random.fold_in(key, 1), (2, FLIGHTS))
     place = jax.vmap(lambda k: Drone().reset(k)[1])(reset_keys)
     heading = jax.jit(jax.vmap(lambda o, k: jnp.clip(policy((), o, k)[1], -1.0, 1.0)))(place, act_keys)
