@@ -9,11 +9,11 @@ from .ensembles import total_variance as total_variance
 from .fit import Regression as Regression
 from .fit import fit as fit
 from .fit import fit_model as fit_model
-from .learned import LearnedModel as LearnedModel
-from .learned import Objective as Objective
 from .latent import LatentMBRL as LatentMBRL
 from .latent import LatentModel as LatentModel
 from .latent_linear import fit_linear_gaussian as fit_linear_gaussian
+from .learned import LearnedModel as LearnedModel
+from .learned import Objective as Objective
 from .mbrl import ModelBased as ModelBased
 from .posteriors import Bootstrap as Bootstrap
 from .posteriors import Dropout as Dropout

@@ -50,7 +50,7 @@ from ..core import (
 from ..nn import Linear, Optimiser, RunningNorm, flat_size, flatten_observation
 from ..planning.mpc import MPC, CrossEntropy, Planner
 from ..planning.problem import ModelProblem
-from .ensembles import encode_action
+from .learned import encode_action
 
 DECAY = 0.99
 """Of the running mean and variance of the latents."""
