@@ -6,9 +6,8 @@ import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 
-from rewardtogo.core import Environment, EnvSpec, Transition, env_spec, from_space
+from rewardtogo.core import Algorithm, Environment, EnvSpec, Transition, env_spec, from_space
 from rewardtogo.data import Dataset
-from rewardtogo.loops.offline import Offline
 
 
 def steps(observation, action, spec: EnvSpec, length: int = 10, extras=None) -> Dataset:
@@ -22,12 +21,12 @@ def steps(observation, action, spec: EnvSpec, length: int = 10, extras=None) -> 
 
 
 @partial(jax.jit, static_argnames="iterations")
-def _fit(algorithm: Offline, key, iterations: int):
+def _fit(algorithm: Algorithm, key, iterations: int):
     state, keys = algorithm.init(key), jax.random.split(key, iterations)
     return jax.lax.scan(lambda s, k: algorithm.step(s, k), state, keys)
 
 
-def run(algorithm: Offline, key, iterations: int):
+def run(algorithm: Algorithm, key, iterations: int):
     """State and metrics by iteration, all in one program."""
     fit = partial(_fit, iterations=iterations)
     fit = fit if key.ndim == 0 else jax.vmap(fit, in_axes=(None, 0))

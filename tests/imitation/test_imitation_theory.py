@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from imitating import run, spec_of, steps
 
-from rewardtogo.core import Batch
+from rewardtogo.core import Batch, env_spec
 from rewardtogo.envs.tabular import TabularEnv
 from rewardtogo.envs.tabular_problems import GROUND, ROPE, TIGHTROPE_EXPERT, random_mdp, random_policy, tightrope
+from rewardtogo.envs.time_limit import TimeLimit
+from rewardtogo.envs.vectorize import vectorize
 from rewardtogo.exact import (
     TablePolicy,
     enumerate_trajectories,
     expected_return,
     one_hot_policy,
+    optimal_q_values,
     simulate,
     softmax_policy,
     state_distributions,
@@ -24,6 +27,8 @@ from rewardtogo.exact import (
 )
 from rewardtogo.imitation import (
     BC,
+    DAgger,
+    as_expert,
     data_mismatch,
     error_bounds,
     expected_mistakes,
@@ -274,6 +279,29 @@ def test_labels_on_the_ground_make_it_linear(recovers, item):
             check(
                 slope(horizons, lost), ">=", 1.7, "slope of the reward that is lost without one: quadratic again (E2.5)"
             )
+
+
+def test_the_data_comes_to_look_like_the_policy(key, item):
+    """As DAgger goes on, what it has learnt from is ever more of what its policy comes to (notes 2.2)."""
+    mdp, horizon = random_mdp(5, 8, 3, concentration=0.1), 20
+    labels = jnp.asarray(optimal_q_values(mdp).argmax(-1), jnp.int32)
+    env = vectorize(TimeLimit(TabularEnv(mdp), horizon), 16)
+    learner = BC(network=MLP(), learning_rate=0.1)
+    expert = as_expert(lambda o: labels[o], env_spec(env))
+    algorithm = DAgger(env, learner, expert, unroll=horizon, updates=30, beta=0.0).with_horizon(16)
+    step = jax.jit(lambda state, key: algorithm.step(state, key)[0])
+    act = jax.jit(lambda s: jax.vmap(lambda o: learner.policy(s, False)((), o, key)[1])(jnp.arange(8)))
+    state, found = jax.jit(lambda k: algorithm.init(k))(key), []
+    for i in range(16):
+        state = step(state, jax.random.fold_in(key, i))
+        seen = np.asarray(state.data.observation[: int(state.written)])
+        policy = one_hot_policy(np.asarray(act(state.learner)), 3)
+        found.append(data_mismatch(mdp, seen, policy, horizon))
+    with item("2.11") as check:
+        check(found[0], ">", 0.1, "total variation between the data and the policy after a round")
+        check(found[-1], "<", 0.05, "after 16 rounds")
+        order = np.corrcoef(np.argsort(np.argsort(found)), np.arange(16))[0, 1]
+        check(order, "<", -0.8, "rank correlation with the round")
 
 
 def test_what_is_refused():

@@ -19,10 +19,12 @@ ITEMS = {"mixture": "2.20", "autoregressive": "2.22", "latent": "2.21"}
 
 def flown(name: str, key) -> tuple[np.ndarray, np.ndarray]:
     """Of 2,000 flights, by sampling and by the mode: whether they end in the tree; and which side each takes."""
-    learner = BC(network=MLP(32), head=HEADS[name], learning_rate=Linear(0.05 if name == "latent" else 5e-3, 0.0))
-    state, _ = run(Offline(flights(DRONE, 1000, key), learner, batch_size=128, updates=20), key, 40)
-    keys = jax.random.split(jax.random.fold_in(key, 1), 2000)
-    place = jax.vmap(lambda k: DRONE.reset(k)[1])(keys)
+    latent = name == "latent"
+    learner = BC(network=MLP(32), head=HEADS[name], learning_rate=Linear(0.03 if latent else 5e-3, 0.0))
+    algorithm = Offline(flights(DRONE, 1000, key), learner, batch_size=256 if latent else 128, updates=20)
+    state, _ = run(algorithm, key, 80 if latent else 40)
+    reset_keys, keys = jax.random.split(jax.random.fold_in(key, 1), (2, 2000))
+    place = jax.vmap(lambda k: DRONE.reset(k)[1])(reset_keys)
     hits, sides = [], []
     for explore in (True, False):
         policy = learner.policy(state.learner, explore)

@@ -91,7 +91,7 @@ def test_pictures_share_an_encoder(network, key, item):
     from rewardtogo.nn import is_recurrent, unroll
 
     spec = env_spec(Lane(picture=True)).observation
-    torso = network.build(spec, key)
+    torso = jax.jit(lambda k: network.build(spec, k))(key)  # the runner builds networks in a compiled program
     pictures = jax.random.randint(key, (6, *spec.shape), 0, 255).astype(jnp.uint8)
     done = jnp.asarray([False, False, True, False, False, False])
     _, features = jax.jit(lambda p, d: unroll(torso, torso.init(), p, d))(pictures, done)

@@ -1,5 +1,6 @@
 """A car that is steered by pictures (items 2.32 and 2.33): data from the middle of the lane, and three ways to get the way back into it."""
 
+import dataclasses
 from functools import partial
 
 import gymnasium.spaces as spaces
@@ -86,6 +87,35 @@ def test_noise_on_the_demonstrator(survival, key, item):
             1000,
             "steps that BC survives, from a demonstrator with noise (DART)",
         )
+
+
+@pytest.mark.slow
+def test_more_demonstrations_help_until_they_do_not(key, item):
+    """Return against the number of demonstrations (item 2.31), in drives of at most 300 steps; five seeds, each with data of its own."""
+    counts, gusty = (1, 2, 5, 10, 50), vectorize(TimeLimit(Lane(picture=True), 20), 10)
+    evaluate = Evaluator(vectorize(TimeLimit(Lane(picture=True), 300), 20), 20)
+    lengths = np.zeros((5, len(counts)))
+    for seed in range(5):
+        mine = jax.random.fold_in(key, seed)
+        everything = play(gusty, Recorded(EXPERT_DRIVER, env_spec(gusty)), 50, mine)
+        for j, n in enumerate(counts):
+            # The first n episodes, so often that there are 50: the same batches on average, and one program for all n.
+            rows = np.tile(np.arange(n * 20), 50 // n)
+            data = dataclasses.replace(
+                everything, transitions=jax.tree.map(lambda x, r=rows: x[r], everything.transitions)
+            )
+            lengths[seed, j] = np.mean(evaluate(cloned(data, mine), jax.random.fold_in(mine, 1))[0])
+    median, error = np.median(lengths, 0), lengths.std(0, ddof=1) / np.sqrt(5)
+    falls = np.array([median[j] - median[j + 1] - np.hypot(error[j], error[j + 1]) for j in range(4)])
+    with item("2.31") as check:
+        check(
+            falls.max(),
+            "<=",
+            0,
+            "fall of the median return from one number of demonstrations to the next, beyond a standard error",
+        )
+        check(median[0] / median[-1], "<", 0.8, "return of one demonstration, in that of 50")
+        check(median[-2] / median[-1], ">=", 0.95, "return of 10, in that of 50: it saturates")
 
 
 # --- the augmentation itself -------------------------------------------------------------------------------------------

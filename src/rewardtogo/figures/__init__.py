@@ -10,6 +10,14 @@ from ..catalogue import nearest
 FIGURES = {
     "1.1": ("markov_chain", "a Markov chain, its simulation, and where its state distribution goes"),
     "1.2": ("anatomy", "the anatomy of reinforcement learning: the three parts of the loop, and the time each takes"),
+    "2.1": ("drift", "a copy of an expert drifts away from where its data was, and DAgger does not"),
+    "2.2": (
+        "history",
+        "a recurrent policy with one encoder, what it learns that no memoryless one can, and what history costs",
+    ),
+    "2.3": ("tree", "past a tree on the left or on the right: a Gaussian and three laws with several peaks"),
+    "tightrope": ("tightrope_mistakes", "mistakes in T steps: in proportion to T squared for a copy, to T for DAgger"),
+    "causal-confusion": ("causal_confusion", "a brake light makes a copy look better and drive worse, and two cures"),
     "3.1": (
         "likelier_trajectories",
         "three trajectories before and after a step of the policy gradient: the more rewarding, the more probable",

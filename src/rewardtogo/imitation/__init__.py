@@ -2,6 +2,11 @@
 
 from .augment import augmented as augmented
 from .bc import BC as BC
+from .causal import GraphChoice as GraphChoice
+from .causal import GraphPolicy as GraphPolicy
+from .causal import choose_graph_by_queries as choose_graph_by_queries
+from .causal import choose_graph_by_return as choose_graph_by_return
+from .causal import with_random_graphs as with_random_graphs
 from .dagger import DAgger as DAgger
 from .dagger import Queries as Queries
 from .experts import Fallible as Fallible

@@ -63,7 +63,7 @@ class StochasticPolicy(Policy):
         return self.network.init()
 
     def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
-        carry, distribution = self._look(carry, observation)
+        carry, distribution = self.look(carry, observation)
         if self.explore:
             action, log_prob = distribution.sample_and_log_prob(key)
         else:
@@ -72,7 +72,7 @@ class StochasticPolicy(Policy):
         return carry, action, {"log_prob": log_prob}
 
     def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
-        _, distribution = self._look(carry, observation)
+        _, distribution = self.look(carry, observation)
         thoughts = {"entropy": distribution.entropy()}
         if isinstance(distribution, Categorical):
             thoughts["probabilities"] = distribution.probs
@@ -86,5 +86,6 @@ class StochasticPolicy(Policy):
             }
         return thoughts
 
-    def _look(self, carry: Carry, observation: Observation) -> tuple[Carry, Distribution]:
+    def look(self, carry: Carry, observation: Observation) -> tuple[Carry, Distribution]:
+        """The memory after the observation, and the law that the action is drawn from."""
         return self.network(carry, observation if self.norm is None else self.norm(observation))

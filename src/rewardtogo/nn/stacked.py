@@ -11,6 +11,7 @@ import dataclasses
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..core import Carry, Observation, PRNGKey, Spec
@@ -48,7 +49,7 @@ def _joined(spec: Spec, size: int) -> Spec:
     """What the inner network observes: a picture with more channels, or else one long vector."""
     if spec.is_image:
         low, high = spec.bounds()
-        bounds = [tuple(jnp.concatenate([jnp.asarray(b)] * size, -1).ravel().tolist()) for b in (low, high)]
+        bounds = [tuple(np.concatenate([b] * size, -1).ravel().tolist()) for b in (low, high)]
         return dataclasses.replace(spec, shape=(*spec.shape[:-1], spec.shape[-1] * size), low=bounds[0], high=bounds[1])
     if has_images(spec):
         raise ValueError(
