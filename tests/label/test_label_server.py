@@ -105,7 +105,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with begin(tmp_path_factory.mktemp("page") / "run", size=40) as run:
         served = Served(run, pause=0.0)
         yield served
-        last = Browser(served.port, "the last one")
+        last = Browser(served.port, "zoe")
         last.answer(last.view(), action=1)
         last.ask("/api/finish", round=1)
         while last.view()["status"] != "done":

@@ -89,7 +89,7 @@ class Desk:
             },
         }
 
-    def view(self, who: str, at: int | None = None) -> dict[str, Any]:
+    def view(self, who: Any, at: Any = None) -> dict[str, Any]:
         """The observation number `at`, or the next one that waits for this labeller, and where everything stands."""
         batch = self.run.round
         base = {"status": self.status, "rounds": self.run.rounds, "results": self._results, "item": None}
