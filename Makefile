@@ -14,7 +14,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,docs,render,mujoco,box2d,minari,tensorboard,onnx,export,atari]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,docs,render,mujoco,box2d,minari,tensorboard,onnx,export,atari,web]'
 	touch $@
 
 train: $(VENV)/.installed

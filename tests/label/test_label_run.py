@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -11,9 +12,17 @@ import pytest
 from safetensors.numpy import load_file
 
 import rewardtogo as rtg
+from rewardtogo.core import env_spec
 from rewardtogo.data.files import Damaged
+from rewardtogo.envs.cartpole import CartPole
+from rewardtogo.envs.time_limit import TimeLimit
+from rewardtogo.envs.vectorize import vectorize
+from rewardtogo.imitation import BC, DAgger, Fallible, as_expert
 from rewardtogo.label import LabelledRun, answer_by, open_labelling, start_labelling
+from rewardtogo.nn import MLP
 from rewardtogo.runner.collect import collect_demonstrations
+from rewardtogo.runner.engine import run as train
+from rewardtogo.runner.evaluate import Evaluator
 
 LEARNER = {"network": {"sizes": [8]}, "learning_rate": 0.01}
 LOOP = {"updates": 5, "batch_size": 16}
@@ -214,3 +223,49 @@ def test_other_runs_and_damaged_ones(scripted, tmp_path):
         (tmp_path / "run" / "labels" / "00000001" / "round.json").unlink()
     with pytest.raises(Damaged, match=r"round.json is damaged or missing"):
         open_labelling(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_how_wrong_a_labeller_may_be(item):
+    """Return against the share of random labels, median of three seeds, and what a majority of nine mends."""
+    env = vectorize(TimeLimit(CartPole(), 200), 2)
+    spec, evaluate = env_spec(env), Evaluator(vectorize(TimeLimit(CartPole(), 200), 50), 50)
+
+    def returns(noise: float, votes: int = 1) -> list[float]:
+        expert = Fallible(as_expert(balance, spec), spec, noise=noise, votes=votes)
+        asking = DAgger(env, BC(network=MLP(32), learning_rate=3e-3), expert, unroll=40, updates=300, beta=0.0)
+        states = [train(asking, jax.random.key(seed), 6)[0] for seed in range(3)]
+        return sorted(float(evaluate(asking.policy(state), jax.random.key(9))[0].mean()) for state in states)
+
+    medians = [returns(noise)[1] for noise in (0.0, 0.2, 0.5, 0.8, 1.0)]
+    mended = returns(0.2, votes=9)
+    with item("2.9") as check:
+        check(medians[0] / 200, ">=", 0.95, "return without noise, in the expert's")
+        check(
+            max(b - a for a, b in pairwise(medians)), "<=", 10, "rise of the return from one noise to the next, of 200"
+        )
+        check(medians[-1] / 200, "<=", 0.2, "return where every label is random, in the expert's")
+        check(mended[0] / 200, ">=", 0.95, "worst of three seeds, every fifth label random, majority of nine")
+
+
+def test_a_majority_of_labellers_mends_their_errors(tmp_path, item):
+    """Five people, each wrong in one answer of five, through the queue: the settled labels are the expert's almost everywhere."""
+    draws = np.random.default_rng(0)
+    with begin(tmp_path / "run", rounds=1, size=300, votes=5) as run:
+        assert run.round is not None
+        queue = run.round.queue
+        right = np.asarray(jax.vmap(balance)(jnp.asarray(queue.observations)))
+        for who in "abcde":
+            wrong = draws.random(queue.size) < 0.2
+            for index in range(queue.size):
+                queue.label(index, int(right[index]) ^ int(wrong[index]), who)
+        labels, known = queue.labels()
+        with item("2.9") as check:
+            check(known.sum(), "==", 300, "observations settled by five votes")
+            check(
+                (labels != right).mean(),
+                "<=",
+                0.1,
+                "errors of the majority, where each is wrong in 0.2: 0.058 expected",
+            )
+        assert queue.progress()["disputed"] > 100

@@ -21,7 +21,7 @@ pytest.importorskip("starlette", reason="the page needs the extra web")
 pytest.importorskip("uvicorn", reason="the page needs the extra web")
 
 from rewardtogo.cli.main import main
-from rewardtogo.label import LabelledRun, open_labelling, start_labelling
+from rewardtogo.label import LabelledRun, start_labelling
 from rewardtogo.label.server import FILES, PAGE, listen, new_token, serve
 
 TOKEN = "only-for-tests"
@@ -105,7 +105,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with begin(tmp_path_factory.mktemp("page") / "run", size=40) as run:
         served = Served(run, pause=0.0)
         yield served
-        finish_all(Browser(served.port, "the last one"))
+        last = Browser(served.port, "zoe")
+        last.answer(last.view(), action=1)
+        last.ask("/api/finish", round=1)
+        while last.view()["status"] != "done":
+            time.sleep(0.05)
         served.end()
 
 
@@ -264,12 +268,13 @@ def test_a_batch_that_is_done_feeds_the_next_round(tmp_path):
         assert ann.ask("/api/finish", round=2)[0] == 400
         ann.answer(view, action=1)
         assert ann.ask("/api/finish", round=2)[0] == 200
-        while ann.view()["round"] != 3:
+        while (view := ann.view())["round"] != 3 or view["status"] != "labelling":
+            assert time.monotonic() < until + 60
             time.sleep(0.05)
         assert finish_all(ann) == 12
         served.end()
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["env_steps"] == 36
-    assert open_labelling(tmp_path / "run", quiet=True).result().metrics["labels"].tolist() == [12, 13, 25]
+    assert run.result().metrics["labels"].tolist() == [12, 13, 25]
 
 
 def test_answers_in_less_than_50_ms_with_10_000_waiting(tmp_path):

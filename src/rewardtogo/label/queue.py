@@ -183,7 +183,7 @@ class LabelQueue:
 
     # --- questions and answers ------------------------------------------------------------------------------------------------------
 
-    def next(self, who: str) -> int | None:
+    def next(self, who: Any) -> int | None:
         """The first observation that waits for this labeller and that nobody else is looking at; None where there is none."""
         who = self.labeller(who)
         with self._lock:

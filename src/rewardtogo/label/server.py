@@ -89,7 +89,7 @@ class Desk:
             },
         }
 
-    def view(self, who: str, at: int | None = None) -> dict[str, Any]:
+    def view(self, who: Any, at: Any = None) -> dict[str, Any]:
         """The observation number `at`, or the next one that waits for this labeller, and where everything stands."""
         batch = self.run.round
         base = {"status": self.status, "rounds": self.run.rounds, "results": self._results, "item": None}
@@ -138,9 +138,10 @@ class Desk:
 
     # --- what labellers do ----------------------------------------------------------------------------------------------------------
 
-    def answer(self, who: str, request: dict[str, Any]) -> dict[str, Any]:
+    def answer(self, who: Any, request: dict[str, Any]) -> dict[str, Any]:
         """Take an answer, a pass, or the last one back, and give what is to be looked at next."""
         queue = self.batch(request.get("round")).queue
+        who = queue.labeller(who)
         if request.get("undo"):
             back = queue.undo(who)
             if back is None:
@@ -357,6 +358,7 @@ def serve(
                     time.sleep(0.02)
             if desk.status == "done":  # the page is to say so before it has nobody to ask
                 desk.seen_done.wait(timeout=3.0)
+                time.sleep(0.3)  # and what tells it is still on its way
         if asked.raised:
             raise Interrupted(f"stopped; every answer is kept: go on with `rtg label {run.folder.path}`")
         return run.result()
