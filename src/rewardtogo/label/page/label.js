@@ -165,7 +165,7 @@ function draw(item) {
   const canvas = $("plot"), pen = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(name).trim();
   const lines = Math.max(1, item.numbers.length), height = Math.max(56, Math.min(110, 420 / lines));
-  const scale = devicePixelRatio || 1, width = 640;
+  const scale = devicePixelRatio || 1, width = canvas.clientWidth || 640;
   canvas.width = width * scale; canvas.height = height * lines * scale;
   pen.scale(scale, scale);
   pen.font = "13px system-ui, 'DejaVu Sans', sans-serif";
