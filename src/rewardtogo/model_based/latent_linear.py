@@ -15,6 +15,7 @@ Rewards that depend on the state are entries of the observation here. Source: no
 """
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -214,8 +215,11 @@ def fit_linear_gaussian(
     return Solution(fitted, settled, {"log_likelihood": history, "iterations": jnp.asarray(iterations)})
 
 
-def _fit(system: LinearGaussian, observations: Array, actions: Array, iterations: int) -> tuple[LinearGaussian, Array]:
-    run = lambda s: jax.lax.scan(  # noqa: E731
-        lambda now, _: expectation_maximisation(now, observations, actions), s, None, length=iterations
-    )
-    return jax.jit(run)(system)
+@partial(jax.jit, static_argnames="iterations")
+def _fit(
+    system: LinearGaussian, observations: Float[Array, "N T O"], actions: Float[Array, "N S U"], iterations: int
+) -> tuple[LinearGaussian, Float[Array, "K"]]:
+    def step(now: LinearGaussian, _: None) -> tuple[LinearGaussian, Array]:
+        return expectation_maximisation(now, observations, actions)
+
+    return jax.lax.scan(step, system, None, length=iterations)

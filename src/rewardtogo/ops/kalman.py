@@ -32,6 +32,8 @@ class LinearGaussian(eqx.Module):
     - `G` `[O, X]`, `g` `[O]`, `sensor_noise` `[O, O]`: what is seen of a state.
     - `mean` `[X]`, `covariance` `[X, X]`: of the first state.
 
+    What is seen must be uncertain beforehand: G P G' + `sensor_noise` positive definite.
+
     The first six may have a leading axis of time; entry t of the dynamics leads from t to t + 1. Offsets left out are zeros.
     Raises `ValueError` for shapes that do not fit each other.
     """
