@@ -34,4 +34,4 @@ def test_the_drawing_shows_these_flights(monkeypatch):
     FigureCanvasAgg(figure).draw()
     axes = [a for a in figure.get_axes() if a.get_title().endswith("in the tree")]
     assert [a.get_title() for a in axes] == [f"{name}: 25 % in the tree" for name in HEADS]
-    assert all(sum(p.get_bbox().height for p in a.patches[1:]) == 4 for a in axes)
+    assert all(sum(p.get_path().get_extents(p.get_patch_transform()).height for p in a.patches[1:]) == 4 for a in axes)

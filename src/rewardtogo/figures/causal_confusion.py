@@ -12,12 +12,13 @@ Source: notes, section 2.3.1, erratum E2.10 (items 2.16 to 2.18); de Haan, Jayar
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..core import Algorithm, Policy, PRNGKey, env_spec
+from ..core import Algorithm, Batch, Policy, PRNGKey, env_spec
 from ..data.episodes import Dataset
 from ..envs.imitation_problems import Braking, brake
 from ..envs.vectorize import vectorize
@@ -48,7 +49,7 @@ def returned(env: Braking, policy: Policy, key: PRNGKey) -> float:
 
 
 class Cloned(NamedTuple):
-    """Least validation loss of BC, and the return of the policy that has it."""
+    """Mean -log pi(a* | o) of BC on data of the expert's that it did not learn from, and its return."""
 
     loss: float
     earned: float
@@ -57,9 +58,12 @@ class Cloned(NamedTuple):
 def clone(light: bool, seed: int = 0) -> Cloned:
     """BC from the expert's data, with or without the light."""
     env, key = Braking(light), jax.random.key(seed)
-    algorithm = Offline(demonstrations(env, key), LEARNER, batch_size=1000, updates=10, validation=0.2)
-    state, metrics = run(algorithm, key, 30, row_every=1)
-    return Cloned(float(metrics["best_validation_loss"][-1]), returned(env, algorithm.policy(state), key))
+    algorithm = Offline(demonstrations(env, key), LEARNER, batch_size=1000, updates=10)
+    state, _ = run(algorithm, key, 30)
+    held_out = demonstrations(env, jax.random.fold_in(key, 1))
+    batch = Batch(held_out.transitions, jnp.arange(held_out.num_steps), jnp.ones(held_out.num_steps))
+    loss = jax.jit(lambda learner: LEARNER.update(learner, batch, key)[1]["bc_loss"])(state.learner)
+    return Cloned(float(loss), returned(env, algorithm.policy(state), key))
 
 
 def ask(seed: int = 0, rounds: int = ROUNDS) -> Float[np.ndarray, "R"]:
@@ -83,7 +87,7 @@ def intervene(seed: int = 0) -> tuple[Float[np.ndarray, "n"], float]:
     algorithm = Offline(data, BC(network=MLP(16), learning_rate=0.01), batch_size=1000, updates=10)
     policy = algorithm.policy(run(algorithm, key, 30)[0])
     choice = choose_graph_by_return(vectorize(env, 10), policy, SEEN, key)
-    return choice.weights, returned(env, GraphPolicy(policy, jax.numpy.asarray(choice.graph, float), SEEN), key)
+    return choice.weights, returned(env, GraphPolicy(policy, jnp.asarray(choice.graph, float), SEEN), key)
 
 
 def draw(seed: int = 0) -> Figure:

@@ -30,8 +30,9 @@ from ..nn import MLP
 from ..runner.collect import Recorded, play
 from ..runner.engine import run
 
-STEPS, WINDS, ROUNDS, UPDATES = 200, 50, 10, 200
-"""Steps of a drive; drives; rounds of DAgger, each of 4 x 100 labels; gradient steps for each of them, and as many in all for BC."""
+LIMIT, STEPS, WINDS, ROUNDS, UPDATES = 200, 100, 50, 10, 200
+"""Steps of an episode to learn from; of a drive, so few that nobody has turned round; drives; rounds of DAgger, each of
+4 x 100 labels; and gradient steps in each of them, BC taking as many in all."""
 LEARNER = BC(network=MLP(32), learning_rate=3e-3)
 INK, EXPERT, CLONE, ASKED = "#333333", "#999999", "#d55e00", "#0072b2"
 
@@ -69,11 +70,11 @@ def measure(seed: int = 0) -> Drift:
     """Trains both copies, and drives."""
     key = jax.random.key(seed)
     calm, windy = Lane(0.0), Lane()
-    env = vectorize(TimeLimit(calm, STEPS), 1)
+    env = vectorize(TimeLimit(calm, LIMIT), 1)
     spec = env_spec(env)
     expert = as_expert(steer, spec)
     cloning = Offline(play(env, Recorded(expert, spec), 1, key), LEARNER, updates=UPDATES)
-    asking = DAgger(vectorize(TimeLimit(windy, STEPS), 4), LEARNER, expert, unroll=100, updates=UPDATES)
+    asking = DAgger(vectorize(TimeLimit(windy, LIMIT), 4), LEARNER, expert, unroll=100, updates=UPDATES)
     policies = (expert, *(algorithm.policy(run(algorithm, key, ROUNDS)[0]) for algorithm in (cloning, asking)))
     winds = jax.random.split(jax.random.fold_in(key, 1), WINDS)
     paths = [np.asarray(jax.vmap(lambda k, p=p: drive(p, windy, k, STEPS))(winds), np.float64) for p in policies]
@@ -96,7 +97,7 @@ def draw(seed: int = 0) -> Figure:
     road.set_title("twelve winds; the lane is grey", fontsize=11)
     apart.set(xlabel="$t$", yscale="log", xlim=(0, STEPS))
     apart.set_title("mean distance from the expert in the same wind", fontsize=11)
-    for axis, place in ((road, (0.7, 0.7)), (apart, (0.6, 0.5))):
+    for axis, place in ((road, (0.02, 0.72)), (apart, (0.6, 0.5))):
         axis.spines[["top", "right"]].set_visible(False)
         axis.legend(frameon=False, fontsize=9, loc=place)
     return figure
