@@ -94,15 +94,15 @@ def draw(seed: int = 0) -> Figure:
     panels = figure.subplot_mosaic([["expert", 0, 1], ["expert", 2, 3]], width_ratios=[1, 1, 1])  # type: ignore[list-item]
     _draw_flights(panels["expert"], expert_flights(seed))
     axes = [panels[i] for i in range(4)]  # type: ignore[index]
+    for axis in axes[1:]:
+        axis.sharex(axes[0])
+        axis.sharey(axes[0])
     for axis, (name, head) in zip(axes, HEADS.items(), strict=True):
         found = fly(head, seed)
         axis.axvspan(-WIDTH, WIDTH, color=TREE, linewidth=0)
         axis.hist(found.beside, np.linspace(-1.3, 1.3, 53).tolist(), color=COPY)
         axis.set_title(f"{name}: {100 * found.collisions:.0f} % in the tree", fontsize=10)
         axis.spines[["top", "right"]].set_visible(False)
-    for axis in axes[1:]:
-        axis.sharex(axes[0])
-        axis.sharey(axes[0])
     for axis in axes[2:]:
         axis.set_xlabel("where it passes, from the tree's middle")
     return figure
