@@ -107,7 +107,8 @@ def test_score(claim: Claim, tmp_path: Path, item: Any) -> None:
 def test_batch_actor_critic_without_a_discount(tmp_path: Path, item: Any) -> None:
     """Algorithm 3 has gamma = 1, which makes sense where an episode ends: time limit an end, and seen (erratum E1.2).
 
-    V is fitted to lambda-returns: with Monte-Carlo sums of rollouts that cut episodes two seeds of five got there.
+    V is fitted to lambda-returns: with Monte-Carlo sums of rollouts that cut episodes two seeds of five got there. The step size falls to
+    0: without that the last policies of some seeds are not the best ones.
     """
     runs = rtg.train(
         "batch_ac",
@@ -116,7 +117,7 @@ def test_batch_actor_critic_without_a_discount(tmp_path: Path, item: Any) -> Non
         num_seeds=SEEDS,
         num_envs=8,
         loop={"unroll": 128},
-        learner={"gamma": 1.0, "value_target": "td_lambda"},
+        learner={"gamma": 1.0, "value_target": "td_lambda", "learning_rate": "linear:2e-3:0"},
         preset="none",
         out=tmp_path / "run",
         quiet=True,
