@@ -183,7 +183,7 @@ def one_step_error(stack: int) -> float:
     def step(loop, key):
         ensemble, state = loop
         rows = jax.random.randint(key, (256,), 0, len(x))
-        loss = lambda e: gaussian_nll(e(x[rows][None]), y[rows] / scale, False).mean()  # noqa: E731
+        loss = lambda e: gaussian_nll(e(x[rows][None]), y[rows] / scale, 1.0).mean()  # noqa: E731
         change, state = rule.update(jax.grad(loss)(ensemble), state)
         return (optax.apply_updates(ensemble, change), state), None
 
