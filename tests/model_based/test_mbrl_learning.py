@@ -30,7 +30,7 @@ class Hanging(Pendulum):
 
 
 def algorithm(version: str) -> rtg.OffPolicy:
-    """A version as the catalogue has it, in an environment of 100 steps."""
+    """A version as the catalogue has it, in episodes of 200 steps."""
     settings = {
         "v0.5": {"acting": "random", "every": 20},
         "v1.0": {"every": 20},
@@ -40,11 +40,11 @@ def algorithm(version: str) -> rtg.OffPolicy:
         members=1, posterior=rtg.model_based.Bootstrap(False), probabilistic=False, propagation="mean", horizon=20,
         planner=CrossEntropy(samples=100, elites=10, iterations=3), **settings,
     )  # fmt: skip
-    env = rtg.make(lambda: TimeLimit(Hanging(), 100), 1)
+    env = rtg.make(lambda: TimeLimit(Hanging(), 200), 1)
     return rtg.OffPolicy(env, learner, rtg.UniformReplay(10_000), unroll=100, updates=300, batch_size=128, warm_up=200)
 
 
-ITERATIONS = 15
+ITERATIONS = 20
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def runs():
     found: dict[str, np.ndarray] = {}
     for version in ("v0.5", "v1.0", "v1.5"):
         loop = algorithm(version)
-        many = rtg.make(lambda: TimeLimit(Hanging(), 100), 10)
+        many = rtg.make(lambda: TimeLimit(Hanging(), 200), 10)
         spec = env_spec(many)
 
         def one(key, loop=loop, many=many, spec=spec):
@@ -66,7 +66,7 @@ def runs():
                 """What the policy does, and how wrong its model is of it."""
                 policy = loop.policy(state)
                 actor = begin(many, policy, key)
-                _, rollout, episodes = rtg.collect(many, policy, actor, key, 100)
+                _, rollout, episodes = rtg.collect(many, policy, actor, key, 200)
                 t = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rollout.transitions)
                 x, y = dynamics_data(t, spec, True, True)
                 model = loop.learner.model(state.learner)
