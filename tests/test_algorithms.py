@@ -19,6 +19,7 @@ from algorithms_under_test import ALGORITHMS_UNDER_TEST, jit, on_policy, small_e
 from rewardtogo.catalogue import ALGORITHMS, LOOPS
 from rewardtogo.core import Algorithm, Episodes
 from rewardtogo.runner.config import build, options, resolve
+from rewardtogo.runner.policy import load, policies, save_policy
 
 HORIZON = 10
 KEYS = [jax.random.key(seed) for seed in (0, 1)]
@@ -73,6 +74,18 @@ def distance(a: Any, b: Any) -> float:
 def same_bits(a: Any, b: Any) -> bool:
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.asarray(x).tobytes() == np.asarray(y).tobytes() for x, y in pairs)
+
+
+@every
+def test_its_policy_is_stored_and_loaded(name, tmp_path):
+    """With what a planner holds as numbers of Python's, too."""
+    a = algorithm(name)
+    learner, learned = a.learner, a.learned(start(name, 0))  # type: ignore[attr-defined]
+    save_policy(tmp_path, learner, learned, a.spec, {})
+    loaded, stored = load(tmp_path, learner)._policies, policies(learner, learned)
+    numbers = lambda x: jax.random.key_data(x) if jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key) else x  # noqa: E731
+    for mine, theirs in zip(jax.tree.leaves(stored), jax.tree.leaves(loaded), strict=True):
+        np.testing.assert_array_equal(np.asarray(numbers(mine), jnp.asarray(numbers(mine)).dtype), numbers(theirs))
 
 
 @every

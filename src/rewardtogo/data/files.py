@@ -73,6 +73,10 @@ def save_tree(path: Path, tree: PyTree, header: dict[str, str] | None = None) ->
     metadata = {"format": str(FORMAT), **(header or {})}
     seen: dict[int, str] = {}
     for name, leaf in named_leaves(tree).items():
+        if isinstance(leaf, bool | int | float):
+            # A number of Python's has the type that it has in a compiled program, where it will be looked for.
+            arrays[name] = np.asarray(jnp.asarray(leaf))
+            continue
         if id(leaf) in seen:
             metadata[f"same:{name}"] = seen[id(leaf)]
             continue
