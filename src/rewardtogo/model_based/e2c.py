@@ -10,8 +10,8 @@ $$E\big[-\log p(x \mid z) - \log p(x' \mid \hat z')\big] + KL\big(q(z \mid x) \,
 + \lambda\, KL\big(\hat q(z' \mid z, u) \,\Vert\, q(z' \mid x')\big),$$
 
 whose last term makes what is predicted agree with what is seen. All divergences are in closed form: $\det A = 1 + r^\top v$ and the
-diagonal of $A \Sigma A^\top$ need no matrix. To act is to encode, to plan from $\mu$ by iterated regulators with the cost $|z - z_g|^2$ plus
-a price of actions, and to do the first action; $z_g$ encodes the picture of the goal.
+diagonal of $A \Sigma A^\top$ need no matrix. To act is to encode, to plan from $\mu$ by iterated regulators with the cost $|z - z_g|^2$
+plus a price of actions, and to do the first action; $z_g$ encodes the picture of the goal.
 
 Deviations from the paper: nobody gives a picture of the goal, and so it is the one with the greatest reward that was seen in training
 (rewards are used for nothing else); pictures are Gaussian with a fixed deviation in place of Bernoulli; dense networks; the transition
@@ -20,7 +20,7 @@ noise H is 0, as in the paper's own divergence.
 Source: notes 8.3.4, reference 11.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -172,17 +172,17 @@ class E2C(Learner):
     encoder_sizes: tuple[int, ...] = setting((128, 128), "hidden layers of the encoder, and of the decoder in reverse")
     sizes: tuple[int, ...] = setting((64, 64), "hidden layers of the network of A, B and o")
     learning_rate: Number = number(1e-3, "Adam's step size", above=0)
-    observation_scale: Number = number(0.2, "deviation of the observation", above=0)
-    consistency: Number = number(1.0, "lambda: weight of the divergence between predicted and encoded", at_least=0)
+    observation_scale: Number = number(0.3, "deviation of the observation", above=0)
+    consistency: Number = number(5.0, "lambda: weight of the divergence between predicted and encoded", at_least=0)
     action_cost: Number = number(0.01, "price of a squared action, in half-widths of the box", at_least=0)
     gamma: Number = number(1.0, "discount of a plan's costs", at_least=0, at_most=1)
     noise: Number = number(0.3, "exploration: deviation of noise on actions, in half-widths of the box", at_least=0)
     planner: Planner = part(ILQR(iterations=10), "how the actions are found")
-    horizon: int = setting(10, "H: actions in a plan", at_least=1)
+    horizon: int = setting(20, "H: actions in a plan", at_least=1)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
 
     @property
-    def batch(self) -> str:
+    def batch(self) -> Literal["transitions"]:
         return "transitions"
 
     @property
@@ -201,7 +201,7 @@ class E2C(Learner):
             networks,
             RunningNorm.of(spec.observation),
             spec.observation.zeros(),
-            jnp.full((), -jnp.inf),
+            jnp.full((), jnp.finfo(jnp.float32).min),
             Optimiser(0.0, 1.0).init(networks),
             jnp.zeros((), jnp.int32),
             spec,
@@ -211,9 +211,7 @@ class E2C(Learner):
         """What has been learned, as a model to plan in."""
         price = jnp.asarray(self.at(state.updates).action_cost, jnp.float32)
         size = jnp.zeros(self.latent_size)
-        model = E2CModel(
-            state.networks, state.observations, size, price, state.spec.observation, state.spec.action
-        )
+        model = E2CModel(state.networks, state.observations, size, price, state.spec.observation, state.spec.action)
         return eqx.tree_at(lambda m: m.goal, model, model.encode(state.goal))
 
     def policy(self, state: E2CState, explore: bool) -> Policy:
