@@ -266,7 +266,7 @@ ALGORITHMS: dict[str, Row] = {
                 "unroll": 50,
                 "updates": 200,
                 "batch_size": 128,
-                "warm_up": 3000,
+                "warm_up": 4000,
                 "replay": {"capacity": 50_000},
             },
             1,

@@ -217,7 +217,8 @@ class E2C(Learner):
     def policy(self, state: E2CState, explore: bool) -> Policy:
         now = self.at(state.updates)
         problem = ModelProblem(self.model(state), self.horizon, state.spec.action, jnp.asarray(now.gamma, jnp.float32))
-        planning = MPC(problem, self.planner)
+        # Python numbers would be stored as float64 with the policy.
+        planning = MPC(problem, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), now.planner))
         if not explore:
             return planning
         return PlanOrRandom(planning, state.updates == 0, jnp.asarray(now.noise, jnp.float32), state.spec.action)
