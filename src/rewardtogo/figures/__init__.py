@@ -53,6 +53,14 @@ FIGURES = {
         "latent_model",
         "the graphical model with latent states, its edges read from the networks that are planned in",
     ),
+    "8.1": (
+        "false_belief",
+        "false belief from overfitting: a planner walks over the cliff that its model does not know, and what an ensemble changes",
+    ),
+    "8.2": (
+        "uncertain_model",
+        "one dimension of a transition as a network estimates it: mean and bands, by three kinds of posterior",
+    ),
 }
 """Number in the notes: the module here that draws it, and what it shows."""
 
