@@ -20,7 +20,7 @@ from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.loops import RandomPolicy, begin
 from rewardtogo.model_based import Dropout, MeanField
-from rewardtogo.planning import AlphaZero, CrossEntropy, Distill, RandomShooting, SelfPlay
+from rewardtogo.planning import ILQR, AlphaZero, CrossEntropy, Distill, RandomShooting, SelfPlay
 from rewardtogo.value.exploration import Boltzmann
 from rewardtogo.value.tabular_q import QLearning
 
@@ -163,6 +163,9 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
             planner=CrossEntropy(samples=6, elites=2, iterations=2),
             horizon=3,
         )
+    ),
+    "e2c": lambda: continuous(
+        rtg.E2C(encoder_sizes=(8,), sizes=(8,), planner=ILQR(iterations=2), horizon=3),
     ),
     "fvi": lambda: off_policy(
         rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)

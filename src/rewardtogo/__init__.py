@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from .loops.off_policy import OffPolicy as OffPolicy
     from .loops.offline import Offline as Offline
     from .loops.on_policy import OnPolicy as OnPolicy
+    from .model_based.e2c import E2C as E2C
     from .model_based.latent import LatentMBRL as LatentMBRL
     from .model_based.mbrl import ModelBased as ModelBased
     from .model_based.planet import PlaNet as PlaNet
@@ -105,6 +106,7 @@ _HOMES = {
     "loops.off_policy": "OffPolicy",
     "loops.offline": "Offline",
     "loops.on_policy": "OnPolicy",
+    "model_based.e2c": "E2C",
     "model_based.latent": "LatentMBRL",
     "model_based.mbrl": "ModelBased",
     "model_based.planet": "PlaNet",

@@ -21,6 +21,7 @@ from .opponents import RandomOpponent as RandomOpponent
 from .opponents import Versus as Versus
 from .pendulum import Pendulum as Pendulum
 from .pixel_pendulum import PixelPendulum as PixelPendulum
+from .planar_navigation import PlanarNavigation as PlanarNavigation
 from .registry import make as make
 from .reward_wrappers import NormalizeReward as NormalizeReward
 from .reward_wrappers import RewardFunction as RewardFunction

@@ -19,6 +19,7 @@ from .mountain_car import MountainCar, MountainCarContinuous
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
 from .pixel_pendulum import PixelPendulum
+from .planar_navigation import PlanarNavigation
 from .probes import OneStep, RecallProbe, TruncatedLoop
 from .reward_wrappers import NormalizeReward
 from .tabular import TabularEnv
@@ -48,6 +49,7 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Tightrope": lambda: TabularEnv(tightrope()),
     "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
+    "PlanarNavigation": lambda: TimeLimit(PlanarNavigation(), 40),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
     "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),

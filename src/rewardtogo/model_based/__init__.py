@@ -1,5 +1,6 @@
 """Reinforcement learning with learned models (chapter 8, section 8.3)."""
 
+from .e2c import E2C as E2C
 from .ensembles import Ensemble as Ensemble
 from .ensembles import Prediction as Prediction
 from .ensembles import aleatoric as aleatoric
