@@ -58,12 +58,18 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "loop": {"unroll": 128},
         "learner": {**_PPO, "normalise_observations": True},
     },
-    # gamma 0.9 and 1024 steps a rollout as in RL Zoo.
+    # gamma 0.9 as in RL Zoo. With a constant step size seeds ended between -184 and -538, with longer gradients between -168 and -248.
     ("ppo", "Pendulum-v1"): {
         "steps": 100_000,
         "num_envs": 4,
         "loop": {"unroll": 256},
-        "learner": {"learning_rate": 1e-3, "gamma": 0.9, "epochs": 10, "minibatches": 16, "max_grad_norm": 5.0},
+        "learner": {
+            "learning_rate": "linear:1e-3:0",
+            "gamma": 0.9,
+            "epochs": 10,
+            "minibatches": 16,
+            "max_grad_norm": 0.5,
+        },
     },
     # RL Zoo's, with 16 environments.
     ("ppo", "LunarLander-v3"): {

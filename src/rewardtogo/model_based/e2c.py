@@ -218,7 +218,7 @@ class E2C(Learner):
         now = self.at(state.updates)
         problem = ModelProblem(self.model(state), self.horizon, state.spec.action, jnp.asarray(now.gamma, jnp.float32))
         # Python numbers would be stored as float64 with the policy.
-        planning = MPC(problem, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), now.planner))
+        planning = MPC(problem, now.planner)
         if not explore:
             return planning
         return PlanOrRandom(planning, state.updates == 0, jnp.asarray(now.noise, jnp.float32), state.spec.action)
