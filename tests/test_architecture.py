@@ -413,3 +413,9 @@ def test_nothing_imports_jax_that_does_not_need_it(program):
     code += "heavy = {'jax', 'equinox', 'gymnasium', 'matplotlib', 'starlette', 'uvicorn'} & set(sys.modules)\nassert not heavy, heavy"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_names_of_test_files_are_unique():
+    """pytest imports test files by their names alone."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert len(names) == len(set(names)), sorted({name for name in names if names.count(name) > 1})

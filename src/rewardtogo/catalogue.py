@@ -580,14 +580,14 @@ ENVIRONMENTS: dict[str, str] = {
 """Environments that are compiled with the learner. Every Gymnasium id works besides, through one door."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint for a misspelt name: the nearest known ones, or all of them where none is near."""
+def nearest(name: str, known: Iterable[str], where: str = "rtg list") -> str:
+    """A hint for a misspelt name: the nearest known ones, or where none is near all of them, or of many the command that lists them."""
     known = list(known)
     lower = {k.lower(): k for k in known}
     close = [lower[k] for k in difflib.get_close_matches(name.lower(), list(lower), n=3, cutoff=0.5)]
     if close:
         return f"did you mean {' or '.join(close)}?"
-    return f"known are {', '.join(sorted(known))}" if len(known) <= 12 else "see `rtg list`"
+    return f"known are {', '.join(sorted(known))}" if len(known) <= 12 else f"see `{where}`"
 
 
 def algorithm_row(name: str) -> Row:

@@ -33,7 +33,8 @@ CASES = [
     (f"{PPO} --stepps 3", "'--stepps' --steps"),
     ("list --env", "'--env' --envs"),
     ("eval run --sed 3", "'--sed' --seed"),
-    ("figure 99.9", "'99.9' 1.1"),
+    ("figure 99.9", "'99.9' `rtg figure`"),
+    ("figure tightropes", "'tightropes' tightrope?"),
     # An algorithm against a space, a loop against data, a backend against an environment.
     ("train dqn Pendulum-v1", "DQN discrete box `rtg list`"),
     ("train dqn MountainCarContinuous-v0 --steps 100", "DQN discrete box"),

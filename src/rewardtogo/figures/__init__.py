@@ -68,7 +68,7 @@ FIGURES = {
 def draw(name: str, out: str | None = None, seed: int = 0) -> Path:
     """Draw a figure into a file (`figure-NAME.png` if not said). Raises `ValueError` for a figure that there is not."""
     if name not in FIGURES:
-        raise ValueError(f"there is no figure {name!r}: {nearest(name, FIGURES)}")
+        raise ValueError(f"there is no figure {name!r}: {nearest(name, FIGURES, 'rtg figure')}")
     path = Path(out or f"figure-{name}.png")
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise ValueError(f"a figure is written as .png, .svg or .pdf, not {path.suffix or 'without an ending'!r}")
