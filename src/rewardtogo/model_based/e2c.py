@@ -217,7 +217,6 @@ class E2C(Learner):
     def policy(self, state: E2CState, explore: bool) -> Policy:
         now = self.at(state.updates)
         problem = ModelProblem(self.model(state), self.horizon, state.spec.action, jnp.asarray(now.gamma, jnp.float32))
-        # Python numbers would be stored as float64 with the policy.
         planning = MPC(problem, now.planner)
         if not explore:
             return planning

@@ -50,7 +50,8 @@ from ..core import (
 from ..nn import Linear, Optimiser, RunningNorm, flat_size, flatten_observation
 from ..planning.mpc import MPC, CrossEntropy, Planner
 from ..planning.problem import ModelProblem
-from .learned import encode_action
+from .fit import standards
+from .learned import encode_action, explored
 
 DECAY = 0.99
 """Of the running mean and variance of the latents."""
@@ -235,16 +236,7 @@ class PlanOrRandom(Policy):
     def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
         plan_key, random_key, noise_key = jax.random.split(key, 3)
         after, planned, _ = self.planning(carry, observation, plan_key)
-        guess = self.action.sample(random_key)
-        if self.action.kind == "box":
-            span = jnp.ones(self.action.shape)
-            if self.action.is_bounded:
-                low, high = self.action.bounds()
-                span = jnp.asarray(0.5 * (high - low))
-            planned = self.action.clip(planned + self.noise * span * jax.random.normal(noise_key, span.shape))
-        else:
-            planned = jnp.where(jax.random.uniform(noise_key) < self.noise, guess, planned)
-        return after, jnp.where(self.random, guess, planned), {}
+        return after, explored(self.action, planned, self.random, self.noise, random_key, noise_key), {}
 
     def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
         return self.planning.inspect(carry, observation)
@@ -293,7 +285,7 @@ class LatentMBRL(Learner):
             networks,
             Latents(jnp.zeros(size), jnp.ones(size), jnp.zeros((), jnp.int32)),
             RunningNorm.of(spec.observation),
-            RunningNorm.of(Spec("box", (1,), low=(-jnp.inf,), high=(jnp.inf,))),
+            standards(1),
             Optimiser(0.0, 1.0).init(networks),
             jnp.zeros((), jnp.int32),
             spec,

@@ -150,6 +150,24 @@ class LearnedModel(Model):
         return state.alive.max() < 1e-3
 
 
+def explored(
+    spec: Spec, planned: Action, random: Bool[Array, ""], noise: Float[Array, ""], key: PRNGKey, noise_key: PRNGKey
+) -> Action:
+    """A planned action with noise, or a random one where `random` says so: deviation `noise` in half-widths of the box, or of choices the
+    chance of another.
+    """
+    guess = spec.sample(key)
+    if spec.kind == "box":
+        span = jnp.ones(spec.shape)
+        if spec.is_bounded:
+            low, high = spec.bounds()
+            span = jnp.asarray(0.5 * (high - low))
+        planned = spec.clip(planned + noise * span * jax.random.normal(noise_key, span.shape))
+    else:
+        planned = jnp.where(jax.random.uniform(noise_key) < noise, guess, planned)
+    return jnp.where(random, guess, planned)
+
+
 def encode_action(spec: Spec, action: Action) -> Float[Array, "A"]:
     """An action as a vector: a box clipped and in units of itself where it is bounded, choices as one-hot vectors."""
     if spec.kind == "box":

@@ -46,8 +46,9 @@ from ..nn import Linear, Optimiser, RunningNorm, flat_size, flatten_observation
 from ..ops.distributions import DiagGaussian
 from ..planning.mpc import CrossEntropy, Planner, shifted
 from ..planning.problem import ModelProblem
+from .fit import standards
 from .latent import Dense
-from .learned import encode_action
+from .learned import encode_action, explored
 
 LEAST_STD = 0.1
 """Of the random state, as in PlaNet."""
@@ -269,16 +270,7 @@ class PlaNetPolicy(Policy):
         now, spec = self.filter(carry, observation), self.model.action
         solution = self.planner(self._problem, now, shifted(carry.plan, jnp.where(carry.fresh, 0, 1)), plan_key)
         plan = solution.value.actions
-        planned, guess = plan[0], spec.sample(random_key)
-        if spec.kind == "box":
-            span = jnp.ones(spec.shape)
-            if spec.is_bounded:
-                low, high = spec.bounds()
-                span = jnp.asarray(0.5 * (high - low))
-            planned = spec.clip(planned + self.noise * span * jax.random.normal(noise_key, span.shape))
-        else:
-            planned = jnp.where(jax.random.uniform(noise_key) < self.noise, guess, planned)
-        action = jnp.where(self.random, guess, planned)
+        action = explored(spec, plan[0], self.random, self.noise, random_key, noise_key)
         kept = Remembered(now.memory, now.state, encode_action(spec, action), plan, jnp.zeros((), bool))
         return kept, action, {}
 
@@ -347,7 +339,7 @@ class PlaNet(Learner):
         return PlaNetState(
             networks,
             RunningNorm.of(spec.observation),
-            RunningNorm.of(Spec("box", (1,), low=(-jnp.inf,), high=(jnp.inf,))),
+            standards(1),
             Optimiser(0.0, 1.0).init(networks),
             jnp.zeros((), jnp.int32),
             spec,
