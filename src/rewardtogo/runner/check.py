@@ -22,7 +22,9 @@ def check_by_name(name: str) -> list[Problem]:
         return check_env(COMPILED[name]())
     if ":" not in name:
         if name not in gymnasium.registry:
-            raise ValueError(f"there is no environment {name!r}: {nearest(name, [*gymnasium.registry, *ENVIRONMENTS])}")
+            raise ValueError(
+                f"there is no environment {name!r}: {nearest(name, [*gymnasium.registry, *ENVIRONMENTS], 'rtg list --envs')}"
+            )
         return check_env(name)
     try:
         found = resolve(name)
