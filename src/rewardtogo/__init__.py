@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from .runner.engine import NonFinite as NonFinite
     from .runner.engine import run as run
     from .runner.policy import load as load
+    from .runner.threads import use_threads as use_threads
     from .runner.train import Run as Run
     from .runner.train import resume as resume
     from .runner.train import train as train
@@ -125,6 +126,7 @@ _HOMES = {
     "policy_gradient.vanilla": "PolicyGradient",
     "runner.engine": "Every Moment NonFinite run",
     "runner.policy": "load",
+    "runner.threads": "use_threads",
     "runner.train": "Run resume train",
     "value.cem_q": "CEMQ",
     "value.ddpg": "DDPG",

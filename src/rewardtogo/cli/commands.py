@@ -18,6 +18,7 @@ from ..envs.gymnasium import EnvironmentFailure
 from ..ops.schedules import to_text
 from ..runner.config import PARTS, merge, options, part_of, resolve
 from ..runner.engine import NonFinite
+from ..runner.threads import threads_for, use_threads, used_threads
 from ..runner.train import Interrupted, Run, resume, train
 from .main import INTERRUPTED, SOLVERS, WRONG, RequestError, _say
 
@@ -61,6 +62,7 @@ def perform(name: str, given: argparse.Namespace, groups: dict[str, dict[str, An
 
 
 def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
+    _choose_threads(given)
     file = _config_file(given.config) if given.config else {}
     extra = {
         "learner": merge(file.get("learner", {}), groups["learner"]),
@@ -90,6 +92,17 @@ def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
         for run in found if isinstance(found, list) else [found]:
             own = given.algorithm if ":" in given.algorithm else None
             print(profile(run.path, _learner_for(str(run.path), own)), file=sys.stderr)
+
+
+def _choose_threads(given: argparse.Namespace) -> None:
+    """Those of `--threads`, or of the user's environment, or the number that suits the algorithm."""
+    if given.threads is not None:
+        use_threads(given.threads)
+    elif used_threads() is None:
+        own = ":" in given.algorithm
+        suits = threads_for(given.algorithm if own else algorithm_row(given.algorithm).path, given.env, given.num_seeds)
+        if suits is not None:
+            use_threads(suits)
 
 
 def _config_file(path: str) -> dict[str, Any]:
@@ -168,8 +181,18 @@ def _report(given: argparse.Namespace, found: Run | list[Run]) -> None:
 
 def _resume(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     del groups
+    _threads_of(given.run)
     learner = _learner_for(given.run, given.learner_class)
     _report(given, resume(given.run, steps=given.steps, learner=learner, expert=given.expert, **_limits(given)))
+
+
+def _threads_of(run: str) -> None:
+    """As many as before: sums of floats depend on it, and a resumed run gives the bits of one that was never stopped."""
+    from ..runner.folder import RunFolder
+
+    threads = RunFolder(run).config().get("threads")
+    if threads is not None and used_threads() is None:
+        use_threads(threads)
 
 
 def _learner_for(run: str, path: str | None) -> Any:

@@ -127,6 +127,12 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
         "--num-seeds", type=_whole, default=1, metavar="K", help="train K seeds in one program, one folder each"
     )
     p.add_argument("--num-envs", type=_whole, metavar="B", help="environments side by side")
+    p.add_argument(
+        "--threads",
+        type=_whole,
+        metavar="N",
+        help="threads of the CPU to compute with (default: one, or all for planning, pictures and many seeds)",
+    )
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/ALGORITHM-ENV-SEED-NUMBER)")
     p.add_argument(
         "--backend",

@@ -27,6 +27,7 @@ from .engine import iterations_for, steps_after
 from .evaluate import lanes_for
 from .experts import PERSON, expert_of, is_code
 from .policy import restore_learner
+from .threads import used_threads
 
 DEFAULT_STEPS = 100_000
 MOST_ITERATIONS, MOST_HOSTED = 2**31 - 1, 10_000
@@ -151,6 +152,7 @@ def plan(
         "row_every": row_every,
         "eval_every": eval_every,
         "eval_episodes": eval_episodes,
+        "threads": used_threads(),
         "versions": versions(),
     }
     return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs, eval_episodes), config)
