@@ -122,6 +122,19 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "target_period": 250,
         },
     },
+    # RL Zoo's, double, with a learning rate that falls and a larger replay.
+    ("dqn", "LunarLander-v3"): {
+        "steps": 350_000,
+        "num_envs": 1,
+        "loop": {"unroll": 4, "updates": 4, "batch_size": 128, "replay": {"capacity": 100_000}},
+        "learner": {
+            "learning_rate": "linear:6.3e-4:1e-4",
+            "network": {"class": "mlp", "sizes": [256, 256]},
+            "epsilon": "linear:1:0.05:0.12",
+            "target_period": 250,
+            "double": True,
+        },
+    },
     # RL Zoo's sizes and rates, with eight-step targets, standardised observations, and a replay that forgets nothing. With one step and
     # 10,000 transitions, as in RL Zoo, seeds ended between -102 and -143.
     ("dqn", "MountainCar-v0"): {
