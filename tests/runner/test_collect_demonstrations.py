@@ -1,5 +1,8 @@
 """`rtg collect`: whole episodes of a run's policy as a dataset."""
 
+import json
+import shutil
+
 import jax
 import numpy as np
 import pytest
@@ -82,6 +85,20 @@ def test_unequal_shares_of_given_environments(runs, tmp_path):
 def test_gymnasium_plays_too(runs, tmp_path):
     path, found = collect_demonstrations(runs / "CartPole-v1", 2, tmp_path / "demo", backend="gymnasium")
     assert found["episodes"] == load_dataset(path).num_episodes == 2
+
+
+def test_rewards_are_the_environments_own(runs, tmp_path):
+    """Even where the run divided them by their running deviation for its learner."""
+    config = RunFolder(runs / "Pendulum-v1").config()
+    divided = tmp_path / "divided"
+    shutil.copytree(runs / "Pendulum-v1", divided)
+    config["env"]["kwargs"] = {"normalise_reward": 0.9}
+    (divided / "config.json").write_text(json.dumps(config))
+    rewards = [
+        load_dataset(collect_demonstrations(run, episodes=1, out=tmp_path / f"demo-{i}")[0]).transitions.reward
+        for i, run in enumerate([runs / "Pendulum-v1", divided])
+    ]
+    assert np.array_equal(*rewards) and rewards[0].min() < -1
 
 
 def test_folders_are_numbered(runs, tmp_path, monkeypatch):

@@ -178,7 +178,9 @@ def _environment(described: dict[str, Any], env: Any, backend: str, episodes: in
                 "name the environment to play in"
             )
         name = env = described["id"]
-        backend, kwargs = described["backend"] if backend == "auto" else backend, described["kwargs"]
+        backend = described["backend"] if backend == "auto" else backend
+        # Rewards of a dataset are the environment's own, whatever they were divided by for the learner.
+        kwargs = {key: value for key, value in described["kwargs"].items() if key != "normalise_reward"}
     if isinstance(env, VectorEnv):
         return name, env
     compiled = backend not in ("gymnasium", "envpool") and (not isinstance(env, str) or env in COMPILED)
