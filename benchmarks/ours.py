@@ -17,6 +17,7 @@ import numpy as np
 import rewardtogo as rtg
 from rewardtogo.cli.commands import use_cache
 from rewardtogo.runner.engine import Program
+from rewardtogo.runner.threads import used_threads
 
 ENV = "CartPole-v1"
 TWO = {"network": {"sizes": [64, 64]}}
@@ -344,6 +345,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--backend", default="jax")
     given = parser.parse_args()
+    if given.task != "seeds" and used_threads() is None:
+        rtg.use_threads(1)  # as `rtg train` does for one seed
     print(json.dumps(TASKS[given.task](given)))
 
 
