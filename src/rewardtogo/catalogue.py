@@ -571,6 +571,7 @@ ENVIRONMENTS: dict[str, str] = {
     "Tightrope": "two states: the worst problem for a copy of an expert; the optimum is 50",
     "PixelPendulum": "Pendulum as pictures of 16 x 16 pixels, the last two",
     "PixelPendulumOneFrame": "the same with the last picture alone: needs a memory",
+    "PixelDoubleIntegrator": "a mass pushed in the plane, on the last two pictures of 16 x 16 pixels; to the middle, 25 steps",
     "PlanarNavigation": "an agent among round obstacles on pictures of 16 x 16 pixels; to a corner, 40 steps",
     "TicTacToe": "tic-tac-toe against random moves, either side begins; tells which moves are allowed",
     "TicTacToePerfect": "the same against a player without a mistake: the optimum is 0",

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from rewardtogo.ops import FullGaussian, NormalInverseGamma, linear_posterior, linear_prediction
+from rewardtogo.ops import (
+    FullGaussian,
+    MatrixNormalInverseWishart,
+    NormalInverseGamma,
+    RegressionMoments,
+    linear_posterior,
+    linear_prediction,
+)
 
 NOISE = 0.3
 
@@ -131,3 +138,85 @@ def test_samples_that_do_not_determine_the_weights_are_refused():
     with pytest.raises(ValueError, match="do not determine 2 weights"):
         linear_posterior(many[:, [1, 1]], more, NOISE)
     assert linear_posterior(x, y, NOISE, FullGaussian(jnp.zeros(2), jnp.eye(2))).mean.shape == (2,)
+
+
+def matrix_law(seed: int, freedom: float = 7.0) -> MatrixNormalInverseWishart:
+    rng = np.random.default_rng(seed)
+    square = lambda n: (lambda a: jnp.asarray(a @ a.T + np.eye(n)))(rng.normal(size=(n, n)))  # noqa: E731
+    return MatrixNormalInverseWishart.of(jnp.asarray(rng.normal(size=(2, 3))), square(3), square(2), freedom)
+
+
+def drawn(law: MatrixNormalInverseWishart, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """W and Sigma by scipy's laws."""
+    sigma = scipy.stats.invwishart(float(law.freedom), np.asarray(law.scale)).rvs(count, random_state=0)
+    z = np.random.default_rng(1).normal(size=(count, 2, 3))
+    root = np.linalg.cholesky(np.linalg.inv(law.seen.xx))
+    return np.asarray(law.mean) + np.linalg.cholesky(sigma) @ z @ root.T, sigma
+
+
+def log_density(law: MatrixNormalInverseWishart, w: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    wishart = scipy.stats.invwishart(float(law.freedom), np.asarray(law.scale)).logpdf(np.moveaxis(sigma, 0, -1))
+    gap = w - np.asarray(law.mean)
+    square = np.einsum("nij,njk,kl,nil->n", np.linalg.inv(sigma), gap, np.asarray(law.seen.xx), gap)
+    log_det = 2 * np.linalg.slogdet(law.seen.xx)[1] - 3 * np.linalg.slogdet(sigma)[1]
+    return wishart + 0.5 * (log_det - square - 6 * np.log(2 * np.pi))
+
+
+def test_several_outputs_of_one_are_the_regression_with_unknown_noise():
+    """D = 1 is the normal inverse gamma: means, rates and evidence of two portions of data."""
+    x, y = data(30)
+    small = NormalInverseGamma(
+        jnp.asarray([0.5, -1.0]), jnp.diag(jnp.asarray([2.0, 3.0])), jnp.asarray(2.0), jnp.asarray(0.7)
+    )
+    law = MatrixNormalInverseWishart.of(
+        small.mean[None], small.precision, 2.0 * small.rate[None, None], 2.0 * small.shape
+    )
+    portions = [(x[:10], y[:10]), (x[10:], y[10:])]
+    for part_x, part_y in portions:
+        moments = RegressionMoments.of(part_x, part_y[:, None])
+        assert float(law.log_evidence(moments)) == pytest.approx(float(small.log_evidence(part_x, part_y)), rel=1e-9)
+        small, law = small.observe(part_x, part_y), law.observe(moments)
+    assert np.allclose(law.mean[0], small.mean) and np.allclose(law.scale[0, 0], 2.0 * small.rate)
+    assert float(law.freedom) == pytest.approx(2.0 * float(small.shape))
+
+
+def test_several_outputs_against_samples(item):
+    """E[log N(y; W x, Sigma)], E[log |Sigma|], the KL divergence and the evidence, by scipy's draws of W and Sigma."""
+    law, other = matrix_law(0), matrix_law(1, 9.0)
+    w, sigma = drawn(law, 200_000)
+    off = lambda samples, exact: abs(samples.mean() - float(exact)) / (samples.std() / len(samples) ** 0.5)  # noqa: E731
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=(4, 3)), rng.normal(size=(4, 2))
+    error = y[None] - np.einsum("ndf,kf->nkd", w, x)
+    square = np.einsum("nkd,nde,nke->nk", error, np.linalg.inv(sigma), error)
+    log_det = np.linalg.slogdet(sigma)[1]
+    log_prob = -0.5 * (square + log_det[:, None] + 2 * np.log(2 * np.pi))
+    gaps = [off(log_prob[:, k], law.expected_log_prob(jnp.asarray(x[k]), jnp.asarray(y[k]))) for k in range(4)]
+    ratio = log_density(law, w, sigma) - log_density(other, w, sigma)
+    evidence = np.log(np.exp(log_prob.sum(1)).mean())
+    moments = RegressionMoments.of(jnp.asarray(x), jnp.asarray(y))
+    with item("8.71") as check:
+        check(max(gaps), "<=", 4, "matrix normal inverse Wishart: E[log p(y | x)] against draws, standard errors")
+        check(off(log_det, law.expected_log_det()), "<=", 4, "its E[log |Sigma|], likewise")
+        check(off(ratio, law.kl(other)), "<=", 4, "its KL divergence, likewise")
+        check(abs(evidence - float(law.log_evidence(moments))), "<=", 0.05, "its evidence of 4 samples")
+    assert float(law.kl(law)) == pytest.approx(0.0, abs=1e-9)
+    best = np.linalg.inv(law.noise)
+    assert np.allclose(best, np.linalg.inv(sigma).mean(0), rtol=0.02, atol=0.02)
+
+
+def test_several_outputs_whatever_the_portions():
+    """All at once is one after the other, and a sample that counts twice is two."""
+    rng = np.random.default_rng(0)
+    x, y = jnp.asarray(rng.normal(size=(20, 3))), jnp.asarray(rng.normal(size=(20, 2)))
+    law = matrix_law(0)
+    whole = law.observe(RegressionMoments.of(x, y))
+    parts = law.observe(RegressionMoments.of(x[:7], y[:7])).observe(RegressionMoments.of(x[7:], y[7:]))
+    twice = law.observe(RegressionMoments.of(jnp.tile(x, (2, 1)), jnp.tile(y, (2, 1))))
+    scaled = law.observe(RegressionMoments.of(x, y).scaled(2.0))
+    for one, other in ((whole, parts), (twice, scaled)):
+        assert np.allclose(one.mean, other.mean) and np.allclose(one.scale, other.scale)
+        assert float(one.freedom) == float(other.freedom)
+    flat = MatrixNormalInverseWishart.of(jnp.zeros((2, 3)), 1e-9 * jnp.eye(3), jnp.eye(2), 3.0)
+    least = np.linalg.lstsq(np.asarray(x), np.asarray(y), rcond=None)[0].T
+    assert np.allclose(flat.observe(RegressionMoments.of(x, y)).mean, least, atol=1e-6)

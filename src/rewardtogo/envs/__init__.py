@@ -20,6 +20,7 @@ from .opponents import PerfectOpponent as PerfectOpponent
 from .opponents import RandomOpponent as RandomOpponent
 from .opponents import Versus as Versus
 from .pendulum import Pendulum as Pendulum
+from .pixel_double_integrator import PixelDoubleIntegrator as PixelDoubleIntegrator
 from .pixel_pendulum import PixelPendulum as PixelPendulum
 from .planar_navigation import PlanarNavigation as PlanarNavigation
 from .registry import make as make

@@ -18,6 +18,7 @@ from .imitation_problems import Braking, Drone, Lane, LastTwo
 from .mountain_car import MountainCar, MountainCarContinuous
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
+from .pixel_double_integrator import PixelDoubleIntegrator
 from .pixel_pendulum import PixelPendulum
 from .planar_navigation import PlanarNavigation
 from .probes import OneStep, RecallProbe, TruncatedLoop
@@ -49,6 +50,7 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Tightrope": lambda: TabularEnv(tightrope()),
     "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
+    "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 25),
     "PlanarNavigation": lambda: TimeLimit(PlanarNavigation(), 40),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),

@@ -5,7 +5,9 @@ from .advantages import gae_weights as gae_weights
 from .advantages import n_step_advantages as n_step_advantages
 from .advantages import normalise as normalise
 from .bayesian import LinearPrediction as LinearPrediction
+from .bayesian import MatrixNormalInverseWishart as MatrixNormalInverseWishart
 from .bayesian import NormalInverseGamma as NormalInverseGamma
+from .bayesian import RegressionMoments as RegressionMoments
 from .bayesian import StudentT as StudentT
 from .bayesian import linear_posterior as linear_posterior
 from .bayesian import linear_prediction as linear_prediction

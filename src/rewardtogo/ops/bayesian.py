@@ -16,6 +16,8 @@ p(\theta \mid D)$ and $\arg\max_\theta p(D \mid \theta)$ are the same for a flat
 gamma, conjugate): the predictive law is Student's, with $2a$ degrees of freedom, about $m^\top x$, of squared scale
 $\tfrac{b}{a} (1 + x^\top \Lambda^{-1} x)$.
 
+**Several outputs** y with a full covariance: matrix normal inverse Wishart, likewise conjugate.
+
 Source: notes 8.3.3 (items 8.56 and 8.57); Gelman et al. 2013, chapter 14; Murphy 2012, section 7.6.
 """
 
@@ -25,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jax.scipy.special import betaln, digamma, gammaln
+from jax.scipy.special import betaln, digamma, gammaln, multigammaln
 from jaxtyping import Array, Float, Key, ScalarLike
 
 from .distributions import FullGaussian
@@ -152,3 +154,123 @@ class NormalInverseGamma(eqx.Module):
             + self.shape * jnp.log(self.rate) - after.shape * jnp.log(after.rate)
             + gammaln(after.shape) - gammaln(self.shape)
         )  # fmt: skip
+
+
+class RegressionMoments(eqx.Module):
+    """Sums over samples of x x', y x', y y' and 1: all that a linear regression of y `[D]` on x `[F]` needs to know. They add."""
+
+    xx: Float[Array, "*N F F"]
+    yx: Float[Array, "*N D F"]
+    yy: Float[Array, "*N D D"]
+    count: Float[Array, "*N"]
+
+    @staticmethod
+    def of(x: Float[Array, "N F"], y: Float[Array, "N D"]) -> "RegressionMoments":
+        """Of samples."""
+        return RegressionMoments(x.T @ x, y.T @ x, y.T @ y, jnp.asarray(len(x), x.dtype))
+
+    def __add__(self, other: "RegressionMoments") -> "RegressionMoments":
+        return jax.tree.map(jnp.add, self, other)
+
+    def scaled(self, factor: ScalarLike) -> "RegressionMoments":
+        """As if each sample counted `factor` times."""
+        return jax.tree.map(lambda a: a * jnp.asarray(factor, a.dtype), self)
+
+
+class MatrixNormalInverseWishart(eqx.Module):
+    r"""What is known of W `[D, F]` and Sigma `[D, D]` in y = W x + N(0, Sigma): $\Sigma \sim \mathrm{IW}(\Psi, \nu)$,
+    $W \mid \Sigma \sim \mathrm{MN}(M, \Sigma, \Lambda^{-1})$, conjugate.
+
+    Held by the moments that have been seen, a prior's as if seen: $\Lambda$, $M \Lambda$, $\Psi + M \Lambda M^\top$, and a count
+    $\nu - D - 1$, so that data are added and nothing else. For D = 1 it is `NormalInverseGamma` with $a = \nu / 2$, $b = \Psi / 2$.
+    """
+
+    seen: RegressionMoments
+
+    @staticmethod
+    def of(
+        mean: Float[Array, "D F"], precision: Float[Array, "F F"], scale: Float[Array, "D D"], freedom: ScalarLike
+    ) -> "MatrixNormalInverseWishart":
+        """From M, Lambda, Psi and nu > D - 1."""
+        weighted = mean @ precision
+        count = jnp.asarray(freedom, mean.dtype) - len(mean) - 1.0
+        return MatrixNormalInverseWishart(RegressionMoments(precision, weighted, scale + weighted @ mean.T, count))
+
+    @property
+    def mean(self) -> Float[Array, "D F"]:
+        """M, the mean of W."""
+        return cho_solve((jnp.linalg.cholesky(self.seen.xx), True), self.seen.yx.T).T
+
+    @property
+    def scale(self) -> Float[Array, "D D"]:
+        """Psi."""
+        explained = self.mean @ self.seen.yx.T
+        left = self.seen.yy - 0.5 * (explained + explained.T)
+        return 0.5 * (left + left.T)
+
+    @property
+    def freedom(self) -> Float[Array, ""]:
+        """The degrees of freedom nu."""
+        return self.seen.count + len(self.seen.yy) + 1.0
+
+    @property
+    def noise(self) -> Float[Array, "D D"]:
+        """The inverse of E[Sigma^-1], Psi / nu: the covariance of the Gaussian that E[log p(y | x, W, Sigma)] is made of."""
+        return self.scale / self.freedom
+
+    def observe(self, moments: RegressionMoments) -> "MatrixNormalInverseWishart":
+        """After more samples, in whatever portions they come."""
+        return MatrixNormalInverseWishart(self.seen + moments)
+
+    def expected_log_det(self) -> Float[Array, ""]:
+        """E[log |Sigma|]."""
+        size = len(self.seen.yy)
+        steps = jnp.arange(size, dtype=self.seen.yy.dtype)
+        return _log_det(self.scale) - size * jnp.log(2.0) - digamma(0.5 * (self.freedom - steps)).sum()
+
+    def expected_log_prob(self, x: Float[Array, "F"], y: Float[Array, "D"]) -> Float[Array, ""]:
+        """E[log N(y; W x, Sigma)]: that of a Gaussian of covariance `noise`, less D x' Lambda^-1 x / 2 for not knowing W."""
+        error, size = y - self.mean @ x, len(y)
+        square = error @ cho_solve((jnp.linalg.cholesky(self.noise), True), error)
+        spread = solve_triangular(jnp.linalg.cholesky(self.seen.xx), x, lower=True)
+        return -0.5 * (square + size * (spread @ spread) + self.expected_log_det() + size * jnp.log(2.0 * jnp.pi))
+
+    def log_normaliser(self) -> Float[Array, ""]:
+        """Of the density in its natural parameters; of differences of it the evidence is made."""
+        size, features = self.seen.yx.shape
+        nu = self.freedom
+        return (
+            multigammaln(0.5 * nu, size) + 0.5 * nu * size * jnp.log(2.0)
+            - 0.5 * nu * _log_det(self.scale) - 0.5 * size * _log_det(self.seen.xx)
+            + 0.5 * size * features * jnp.log(2.0 * jnp.pi)
+        )  # fmt: skip
+
+    def log_evidence(self, moments: RegressionMoments) -> Float[Array, ""]:
+        """The logarithm of p(Y | X), W and Sigma integrated out."""
+        size = len(self.seen.yy)
+        after = self.observe(moments)
+        constant = 0.5 * size * moments.count * jnp.log(2.0 * jnp.pi)
+        return after.log_normaliser() - self.log_normaliser() - constant
+
+    def kl(self, other: "MatrixNormalInverseWishart") -> Float[Array, ""]:
+        """KL(self || other) in nats, of laws of the same shape."""
+        size, features = self.seen.yx.shape
+        nu, theirs = self.freedom, other.freedom
+        steps = jnp.arange(size, dtype=nu.dtype)
+        inverse = cho_solve((jnp.linalg.cholesky(self.scale), True), jnp.eye(size, dtype=nu.dtype))
+        wishart = (
+            0.5 * theirs * (_log_det(self.scale) - _log_det(other.scale))
+            + 0.5 * nu * ((inverse * other.scale).sum() - size)
+            + multigammaln(0.5 * theirs, size) - multigammaln(0.5 * nu, size)
+            + 0.5 * (nu - theirs) * digamma(0.5 * (nu - steps)).sum()
+        )  # fmt: skip
+        gap = self.mean - other.mean
+        ratio = cho_solve((jnp.linalg.cholesky(self.seen.xx), True), other.seen.xx)
+        shifted = nu * (inverse * (gap @ other.seen.xx @ gap.T)).sum()
+        weights = size * (jnp.trace(ratio) - features) + shifted
+        weights = weights + size * (_log_det(self.seen.xx) - _log_det(other.seen.xx))
+        return wishart + 0.5 * weights
+
+
+def _log_det(a: Float[Array, "N N"]) -> Float[Array, ""]:
+    return 2.0 * jnp.log(jnp.diagonal(jnp.linalg.cholesky(a))).sum()

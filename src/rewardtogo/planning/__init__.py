@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from .guides import Rollouts as Rollouts
     from .identification import identify as identify
     from .iterated_lqr import ilqr as ilqr
+    from .kl_constrained import StateLaws as StateLaws
+    from .kl_constrained import adapted_step as adapted_step
+    from .kl_constrained import expected_cost as expected_cost
+    from .kl_constrained import kl_constrained_lqr as kl_constrained_lqr
+    from .kl_constrained import state_laws as state_laws
+    from .kl_constrained import trajectory_kl as trajectory_kl
     from .linear_quadratic import LinearController as LinearController
     from .linear_quadratic import LQProblem as LQProblem
     from .linear_quadratic import Regulator as Regulator
@@ -69,6 +75,7 @@ _HOMES = {
     "guides": "Belief Guide Guided Rollouts",
     "identification": "identify",
     "iterated_lqr": "ilqr",
+    "kl_constrained": "StateLaws adapted_step expected_cost kl_constrained_lqr state_laws trajectory_kl",
     "linear_quadratic": "LQProblem LinearController Regulator lqr lqr_infinite riccati",
     "linear_quadratic_gaussian": "Estimating lqg",
     "mpc": "Collocation CrossEntropy GradientShooting ILQR MPC NewtonShooting PathIntegral Planner RandomShooting",
