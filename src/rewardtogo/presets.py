@@ -11,6 +11,9 @@ _PPO = {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_g
 _SMALL = {"class": "mlp", "sizes": [64, 64], "activation": "relu"}
 _SMALL_LOOP = {"unroll": 1, "updates": 1, "batch_size": 128, "warm_up": 500, "replay": {"capacity": 20_000}}
 
+_THREE_MODELS = {"members": 3, "posterior": {"class": "bootstrap", "resample": True}}
+_COURSE_LOOP = {"unroll": 1000, "updates": 1000, "warm_up": 5000, "replay": {"capacity": 20_000}}
+
 # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
 _DQN_CARTPOLE: Preset = {
     "steps": 50_000,
@@ -271,6 +274,9 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "normalise_observations": True,
         },
     },
+    # The course's budgets: 5,000 random steps and 12 iterations of 1,000; and with the arm a quarter of its 15 of 5,000.
+    ("mbrl_v15", "Obstacles"): {"steps": 17_000, "loop": _COURSE_LOOP, "learner": _THREE_MODELS | {"horizon": 10}},
+    ("mbrl_v15", "Reacher"): {"steps": 20_000, "loop": _COURSE_LOOP, "learner": _THREE_MODELS | {"horizon": 10}},
     # Three minutes on two cores.
     ("latent_mbrl", "PixelPendulum"): {"steps": 8_000},
     ("e2c", "PlanarNavigation"): {"steps": 6_000},
