@@ -17,7 +17,6 @@ from rewardtogo.core import Policy, env_spec
 from rewardtogo.envs import KnownModel, Obstacles, Reacher
 from rewardtogo.loops.collect import RandomPolicy, begin
 from rewardtogo.planning import MPC, ModelProblem
-from rewardtogo.runner.evaluate_run import evaluate_run
 from rewardtogo.runner.plan import plan
 
 pytestmark = pytest.mark.slow
@@ -51,7 +50,7 @@ def test_what_is_learned_is_nearly_as_good_as_the_truth(
     runs = rtg.train("mbrl_v15", env, num_seeds=SEEDS, out=tmp_path / "run", quiet=True)
     seconds = (time.process_time() - began) / SEEDS
     assert all(run.config["iterations"] <= iterations for run in runs)
-    returns = [evaluate_run(str(run.path), episodes=EPISODES)["return_mean"] for run in runs]
+    returns = [run.evaluation["return_mean"] for run in runs]
     scores = sorted((found - random) / (best - random) for found in returns)
     print(
         f"\n{env}: random {random:.1f}, true dynamics {best:.1f}, learned {[round(r, 1) for r in sorted(returns)]}, {seconds:.0f} s a seed"
