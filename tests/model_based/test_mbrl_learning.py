@@ -92,8 +92,8 @@ def runs():
 def swing_up(tmp_path_factory):
     """Returns in the swing-up of a cart-pole, five seeds of each.
 
-    Version 0.5 has as many steps as 1.5, all random, and one fit with as many updates as 1.5 makes in all. With `every=1` it plans like 1.5,
-    so that nothing but the data differs.
+    Version 0.5 has as many steps as 1.5, all random, and one fit with as many updates as 1.5 makes in all. With `every=1` it plans like
+    1.5, so that nothing but the data differs.
     """
     once = {"warm_up": 4900, "unroll": 100, "updates": 9000}
     wanted = {
