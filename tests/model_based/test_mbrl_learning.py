@@ -90,17 +90,17 @@ def runs():
 
 @pytest.fixture(scope="module")
 def swing_up(tmp_path_factory):
-    """Returns in the swing-up of a cart-pole, five seeds of each.
+    """Returns in the swing-up of a cart-pole, five seeds of each, and three of SAC.
 
     Version 0.5 has as many steps as 1.5, all random, and one fit with as many updates as 1.5 makes in all. With `every=1` it plans like
     1.5, so that nothing but the data differs.
     """
-    once = {"warm_up": 4900, "unroll": 100, "updates": 9000}
+    once = {"warm_up": 3900, "unroll": 100, "updates": 7000}
     wanted = {
-        "v1.5": ("mbrl_v15", 5000, {}, {}),
-        "v0.5": ("mbrl_v15", 5000, {"acting": "random", "every": 25}, once),
-        "v0.5, replanning": ("mbrl_v15", 5000, {"acting": "random"}, once),
-        "sac, as many steps": ("sac", 5000, {}, {}),
+        "v1.5": ("mbrl_v15", 4000, {}, {}),
+        "v0.5": ("mbrl_v15", 4000, {"acting": "random", "every": 25}, once),
+        "v0.5, replanning": ("mbrl_v15", 4000, {"acting": "random"}, once),
+        "sac, as many steps": ("sac", 4000, {}, {}),
         "sac": ("sac", 80_000, {}, {}),
     }
     found = {}
@@ -109,7 +109,7 @@ def swing_up(tmp_path_factory):
             algorithm,
             "CartPoleSwingUp",
             steps=steps,
-            num_seeds=SEEDS,
+            num_seeds=3 if algorithm == "sac" else SEEDS,
             learner=learner,
             loop=loop,
             out=tmp_path_factory.mktemp("swing") / "run",
@@ -153,10 +153,10 @@ def test_replanning_learns_quickly(item, tmp_path: Path, name: str, env: str, st
 
 
 def test_model_based_is_ahead_early_and_not_late(item, swing_up):
-    """The swing-up: what plans 25 steps ahead in a model against SAC, after as many steps and after sixteen times as many."""
+    """The swing-up: what plans 25 steps ahead in a model against SAC, after as many steps and after twenty times as many."""
     middle = {name: statistics.median(returns) for name, returns in swing_up.items()}
     with item("8.50") as check:
         ahead = middle["v1.5"] - middle["sac, as many steps"]
-        check(ahead, ">", 0, "model-based less model-free after 5,000 steps, swing-up, medians of five seeds")
+        check(ahead, ">", 0, "model-based less model-free after 4,000 steps, swing-up, medians of seeds")
         behind = middle["sac"] - middle["v1.5"]
-        check(behind, ">", 0, "model-free after 80,000 steps less model-based after 5,000")
+        check(behind, ">", 0, "model-free after 80,000 steps less model-based after 4,000")
