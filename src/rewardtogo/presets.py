@@ -11,6 +11,11 @@ _PPO = {"learning_rate": "linear:1e-3:0", "epochs": 10, "minibatches": 8, "max_g
 _SMALL = {"class": "mlp", "sizes": [64, 64], "activation": "relu"}
 _SMALL_LOOP = {"unroll": 1, "updates": 1, "batch_size": 128, "warm_up": 500, "replay": {"capacity": 20_000}}
 
+_SAC_RATES = {"learning_rate": 1e-3, "actor_learning_rate": 1e-3, "temperature_learning_rate": 1e-3}
+_THREE_MODELS = {"members": 3, "posterior": {"class": "bootstrap", "resample": True}}
+_COURSE_LOOP = {"unroll": 1000, "updates": 1000, "warm_up": 5000, "replay": {"capacity": 20_000}}
+_SHORTER = {"unroll": 600, "updates": 600, "warm_up": 3000}
+
 # Eight-step targets carry the end of an episode back in time: with one step fewer than half of the seeds got there.
 _DQN_CARTPOLE: Preset = {
     "steps": 50_000,
@@ -226,12 +231,7 @@ PRESETS: dict[tuple[str, str], Preset] = {
         "steps": 20_000,
         "num_envs": 1,
         "loop": _SMALL_LOOP,
-        "learner": {
-            "network": _SMALL,
-            "learning_rate": 1e-3,
-            "actor_learning_rate": 1e-3,
-            "temperature_learning_rate": 1e-3,
-        },
+        "learner": {"network": _SMALL, **_SAC_RATES},
     },
     # With outputs in units of 1 reward, three seeds of five ended at a bound.
     ("naf", "Pendulum-v1"): {
@@ -283,6 +283,25 @@ PRESETS: dict[tuple[str, str], Preset] = {
             "log_std": -0.5,
             "normalise_observations": True,
         },
+    },
+    # The course's budgets: 5,000 random steps and 12 iterations of 1,000; with the arm its 15 iterations, of 600 steps in place of 5,000.
+    ("mbrl_v15", "Obstacles"): {"steps": 17_000, "loop": _COURSE_LOOP, "learner": _THREE_MODELS | {"horizon": 10}},
+    ("mbrl_v15", "Reacher"): {
+        "steps": 12_000,
+        "loop": _COURSE_LOOP | _SHORTER,
+        "learner": _THREE_MODELS | {"horizon": 10},
+    },
+    # The rise of the pole has to lie within a plan: with 15 steps even the true dynamics leave it hanging.
+    ("mbrl_v15", "CartPoleSwingUp"): {
+        "steps": 4_000,
+        "loop": {"unroll": 100, "updates": 200, "warm_up": 500},
+        "learner": _THREE_MODELS | {"horizon": 25},
+    },
+    ("sac", "CartPoleSwingUp"): {
+        "steps": 80_000,
+        "num_envs": 1,
+        "loop": {**_SMALL_LOOP, "replay": {"capacity": 80_000}},
+        "learner": {"network": _SMALL, **_SAC_RATES},
     },
     # Three minutes on two cores.
     ("latent_mbrl", "PixelPendulum"): {"steps": 8_000},

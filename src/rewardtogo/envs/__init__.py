@@ -4,6 +4,7 @@ from .acrobot import Acrobot as Acrobot
 from .board_games import ConnectFour as ConnectFour
 from .board_games import TicTacToe as TicTacToe
 from .cartpole import CartPole as CartPole
+from .cartpole_swing_up import CartPoleSwingUp as CartPoleSwingUp
 from .catch import Catch as Catch
 from .check import check_env as check_env
 from .gymnasium import EnvironmentFailure as EnvironmentFailure
@@ -14,6 +15,7 @@ from .known import KnownModel as KnownModel
 from .known import Simulation as Simulation
 from .mountain_car import MountainCar as MountainCar
 from .mountain_car import MountainCarContinuous as MountainCarContinuous
+from .obstacles import Obstacles as Obstacles
 from .opponents import Minimax as Minimax
 from .opponents import Opponent as Opponent
 from .opponents import PerfectOpponent as PerfectOpponent
@@ -23,6 +25,7 @@ from .pendulum import Pendulum as Pendulum
 from .pixel_double_integrator import PixelDoubleIntegrator as PixelDoubleIntegrator
 from .pixel_pendulum import PixelPendulum as PixelPendulum
 from .planar_navigation import PlanarNavigation as PlanarNavigation
+from .reacher import Reacher as Reacher
 from .registry import make as make
 from .reward_wrappers import NormalizeReward as NormalizeReward
 from .reward_wrappers import RewardFunction as RewardFunction

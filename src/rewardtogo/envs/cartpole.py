@@ -48,14 +48,19 @@ class CartPole(Observed):
 
 
 def dynamics(state: Float[Array, "4"], action: Action) -> Float[Array, "4"]:
-    """One Euler step of the cart and the pole (Florian 2005, frictionless)."""
+    """One Euler step of the cart and the pole."""
     x, velocity, angle, spin = state
-    force = jnp.where(action == 1, FORCE, -FORCE)
+    linear, angular = accelerations(state, jnp.where(action == 1, FORCE, -FORCE))
+    return jnp.stack(
+        [x + TIME_STEP * velocity, velocity + TIME_STEP * linear, angle + TIME_STEP * spin, spin + TIME_STEP * angular]
+    )
+
+
+def accelerations(state: Float[Array, "4"], force: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Of the cart and of the pole's angle under a force (Florian 2005, frictionless)."""
+    _, _, angle, spin = state
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     total_mass, moment = CART_MASS + POLE_MASS, POLE_MASS * HALF_LENGTH
     push = (force + moment * spin**2 * sine) / total_mass
     angular = (GRAVITY * sine - cosine * push) / (HALF_LENGTH * (4.0 / 3.0 - POLE_MASS * cosine**2 / total_mass))
-    linear = push - moment * angular * cosine / total_mass
-    return jnp.stack(
-        [x + TIME_STEP * velocity, velocity + TIME_STEP * linear, angle + TIME_STEP * spin, spin + TIME_STEP * angular]
-    )
+    return push - moment * angular * cosine / total_mass, angular

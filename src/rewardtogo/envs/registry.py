@@ -11,17 +11,20 @@ from .acrobot import Acrobot
 from .atari import PREFIX, RAW_REWARD, Atari
 from .board_games import ConnectFour, TicTacToe
 from .cartpole import CartPole
+from .cartpole_swing_up import CartPoleSwingUp
 from .catch import Catch
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
 from .imitation_problems import Braking, Drone, Lane, LastTwo
 from .mountain_car import MountainCar, MountainCarContinuous
+from .obstacles import Obstacles
 from .opponents import PerfectOpponent, RandomOpponent, Versus
 from .pendulum import Pendulum
 from .pixel_double_integrator import PixelDoubleIntegrator
 from .pixel_pendulum import PixelPendulum
 from .planar_navigation import PlanarNavigation
 from .probes import OneStep, RecallProbe, TruncatedLoop
+from .reacher import Reacher
 from .reward_wrappers import NormalizeReward
 from .tabular import TabularEnv
 from .tabular_problems import tightrope
@@ -52,6 +55,9 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
     "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 25),
     "PlanarNavigation": lambda: TimeLimit(PlanarNavigation(), 40),
+    "CartPoleSwingUp": lambda: TimeLimit(CartPoleSwingUp(), 100),
+    "Obstacles": lambda: TimeLimit(Obstacles(), 100),
+    "Reacher": lambda: TimeLimit(Reacher(), 50),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
     "ConnectFour": lambda: Versus(ConnectFour(), RandomOpponent()),
