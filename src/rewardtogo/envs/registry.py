@@ -50,7 +50,7 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Tightrope": lambda: TabularEnv(tightrope()),
     "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
-    "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 25),
+    "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 15),
     "PlanarNavigation": lambda: TimeLimit(PlanarNavigation(), 40),
     "TicTacToe": lambda: Versus(TicTacToe(), RandomOpponent()),
     "TicTacToePerfect": lambda: Versus(TicTacToe(), PerfectOpponent()),
