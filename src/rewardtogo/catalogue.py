@@ -282,7 +282,7 @@ ALGORITHMS: dict[str, Row] = {
             "SOLAR: latent states with linear dynamics and quadratic costs, and regulators improved near the data",
             {},
             {"unroll": 15},
-            32,
+            64,
         ),
         Row(
             "npg",

@@ -217,23 +217,23 @@ class SOLAR(Learner):
 
     latent_size: int = setting(4, "X: numbers in the latent state", at_least=1)
     network: Network = part(MLP(64, activation="relu"), "recipe of the recognition network", converter=as_network)
-    decoder_sizes: tuple[int, ...] = setting((64, 128), "hidden layers of the decoder")
+    decoder_sizes: tuple[int, ...] = setting((128, 256), "hidden layers of the decoder")
     horizon: int = setting(15, "H: steps in an episode, and in a rollout", at_least=2)
     warm_up: int = setting(4, "iterations with random actions, before controllers are improved", at_least=1)
-    pretrain: int = setting(400, "gradient steps in each of them", at_least=1)
-    finetune: int = setting(50, "gradient steps in each iteration after them", at_least=0)
-    batch_size: int = setting(16, "episodes in a gradient step", at_least=1)
+    pretrain: int = setting(600, "gradient steps in each of them", at_least=1)
+    finetune: int = setting(200, "gradient steps in each iteration after them", at_least=0)
+    batch_size: int = setting(8, "episodes in a gradient step", at_least=1)
     episodes: int = setting(512, "episodes that are remembered", at_least=1)
-    learning_rate: Number = number(1e-3, "Adam's step size", above=0)
+    learning_rate: Number = number(3e-3, "Adam's step size", above=0)
     natural_rate: Number = number(
         0.05, "share of the global dynamics that each gradient step replaces", above=0, at_most=1
     )
-    observation_scale: Number = number(0.1, "deviation of the observation", above=0)
+    observation_scale: Number = number(0.2, "deviation of the observation", above=0)
     cost_scale: Number = number(0.1, "deviation of the cost, standardised", above=0)
     prior_samples: Number = number(10.0, "episodes that the global model counts for in the local ones", above=0)
     rounds: int = setting(2, "turns of local inference", at_least=1)
-    kl_step: Number = number(1.0, "KL divergence of an update from what was run, nats for each step", above=0)
-    noise: Number = number(0.2, "deviation of the first actions, in half-widths of the box", above=0)
+    kl_step: Number = number(0.5, "KL divergence of an update from what was run, nats for each step", above=0)
+    noise: Number = number(0.1, "deviation of the first actions, in half-widths of the box", above=0)
     max_grad_norm: Number = number(10.0, "gradients are scaled down to this global norm", above=0)
 
     def __check_init__(self) -> None:
