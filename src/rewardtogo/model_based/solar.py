@@ -48,7 +48,7 @@ from ..nn.network import Torso
 from ..ops.bayesian import RegressionMoments
 from ..ops.distributions import DiagGaussian
 from ..ops.kalman import kalman_filter, kalman_gain
-from ..planning.kl_constrained import adapted_step, expected_cost, kl_constrained_lqr
+from ..planning.kl_constrained import adapted_step, expected_cost, kl_constrained_lqr, spread_of
 from ..planning.linear_quadratic import LinearController, LQProblem
 from .fit import standards
 from .latent import Dense
@@ -137,8 +137,13 @@ class Memory(eqx.Module):
         """With B more, in place of the oldest."""
         rows = (self.written + jnp.arange(len(rewards))) % len(self.rewards)
         put = lambda old, new: old.at[rows].set(new)  # noqa: E731
-        old, new = (self.observations, self.actions, self.rewards, self.whole), (observations, actions, rewards, whole)
-        return Memory(*jax.tree.map(put, old, new), self.written + len(rewards))
+        return Memory(
+            jax.tree.map(put, self.observations, observations),
+            put(self.actions, actions),
+            put(self.rewards, rewards),
+            put(self.whole, whole),
+            self.written + len(rewards),
+        )
 
 
 class SOLARPolicy(Policy):
@@ -289,10 +294,10 @@ class SOLAR(Learner):
             jnp.ones(()), zero, zero, Optimiser(0.0, 1.0).init(networks), jnp.zeros((), jnp.int32), spec,
         )  # fmt: skip
 
-    def policy(self, state: SOLARState, explore: bool) -> Policy:
+    def policy(self, state: SOLARState, explore: bool) -> SOLARPolicy:
         controller = state.controller
         if not explore:
-            controller = LinearController(controller.K, controller.k, jnp.zeros_like(controller.spread))
+            controller = LinearController(controller.K, controller.k, jnp.zeros_like(spread_of(controller)))
         dynamics = ExpectedDynamics.of(state.local, self.horizon)
         return SOLARPolicy(
             state.networks, state.observations, dynamics.weights, dynamics.noise, controller, state.spec.action
@@ -373,7 +378,7 @@ class SOLAR(Learner):
         )
         run = state.controller
         if self.finetune:
-            run = self.expressed(expected, potentials, actions, weights)
+            run = self.expressed(expected, potentials, actions, weights, run)
         limit = jnp.asarray(now.kl_step, jnp.float32) * self.horizon
         paid = expected_cost(problem, run, mean, covariance)
         adapted = adapted_step(state.multiplier, state.promised, state.cost - paid)
@@ -404,27 +409,35 @@ class SOLAR(Learner):
         potentials: DiagGaussian,
         actions: Float[Array, "B H A"],
         weights: Float[Array, "B"],
+        run: LinearController,
     ) -> LinearController:
-        """The controllers that were run, on the states that the model filters now: a regression of the actions of each time, with that of
-        all times as prior.
+        """The controllers that were run, on the states that the model filters now: a regression of the actions of each time.
+
+        What was run, on the states of then, is its prior, and counts for one sample.
         """
         size, horizon = self.latent_size, self.horizon
         look = lambda p, a: kalman_filter(dynamics.system(p), p.mean, a).mean[:horizon]  # noqa: E731
         states = jax.vmap(look)(potentials, actions)
         x = jnp.concatenate([states, jnp.ones((*states.shape[:2], 1))], -1)
+        # About what was run: where it has little noise, sums of squares of the actions themselves would lose it in rounding.
+        around = actions - jnp.einsum("tux,btx->btu", run.K, states) - run.k[None]
 
         def moments(x: Array, u: Array) -> RegressionMoments:
             weighted = weights[:, None] * x
             return RegressionMoments(weighted.T @ x, u.T @ weighted, (weights[:, None] * u).T @ u, weights.sum())
 
-        each = jax.vmap(moments, in_axes=1)(x, actions)
-        width = actions.shape[-1]
-        vague = Laws.of(jnp.zeros((width, size + 1)), 1e-3 * jnp.eye(size + 1), 1e-5 * jnp.eye(width), width + 2.0)
-        pooled = vague.observe(jax.tree.map(lambda m: m.sum(0), each))
-        law = jax.vmap(believed(pooled, 5.0).observe)(each)
-        gains = jax.vmap(lambda law: law.mean)(law)
-        spread = jax.vmap(lambda law: jnp.linalg.cholesky(law.noise))(law)
-        return LinearController(gains[..., :size], gains[..., size], spread)
+        each = jax.vmap(moments, in_axes=1)(x, around)
+        count = jnp.maximum(each.count.sum(), 1.0)
+        sample = each.xx.sum(0) / count + 1e-4 * jnp.eye(size + 1)
+        freedom = actions.shape[-1] + 2.0
+
+        def regressed(S: Array, moments: RegressionMoments) -> tuple[Array, Array]:
+            prior = Laws.of(jnp.zeros((len(S), size + 1)), sample, freedom * S @ S.T, freedom)
+            law = prior.observe(moments)
+            return law.mean, jnp.linalg.cholesky(law.noise)
+
+        change, spread = jax.vmap(regressed)(spread_of(run), each)
+        return LinearController(run.K + change[..., :size], run.k + change[..., size], spread)
 
 
 def gathered(
