@@ -167,6 +167,21 @@ ALGORITHMS_UNDER_TEST: dict[str, Callable[[], Algorithm]] = {
     "e2c": lambda: continuous(
         rtg.E2C(encoder_sizes=(8,), sizes=(8,), planner=ILQR(iterations=2), horizon=3),
     ),
+    "solar": lambda: rtg.OnPolicy(
+        rtg.vectorize(TimeLimit(Pendulum(), 8), NUM_ENVS),
+        rtg.SOLAR(
+            network=small,
+            latent_size=2,
+            decoder_sizes=(8,),
+            horizon=8,
+            warm_up=1,
+            pretrain=2,
+            finetune=1,
+            batch_size=4,
+            episodes=8,
+        ),
+        unroll=8,
+    ),
     "fvi": lambda: off_policy(
         rtg.FVI(dynamics=CartPole(), network=small, target_period=2, normalise_observations=True)
     ),

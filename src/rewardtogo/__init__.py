@@ -50,8 +50,10 @@ if TYPE_CHECKING:
     from .model_based.latent import LatentMBRL as LatentMBRL
     from .model_based.mbrl import ModelBased as ModelBased
     from .model_based.planet import PlaNet as PlaNet
+    from .model_based.solar import SOLAR as SOLAR
     from .nn.autoregressive import Autoregressive as Autoregressive
     from .nn.entries import Entries as Entries
+    from .nn.feature_points import FeaturePoints as FeaturePoints
     from .nn.heads import Standard as Standard
     from .nn.latent import Latent as Latent
     from .nn.mixture import Mixture as Mixture
@@ -111,8 +113,10 @@ _HOMES = {
     "model_based.latent": "LatentMBRL",
     "model_based.mbrl": "ModelBased",
     "model_based.planet": "PlaNet",
+    "model_based.solar": "SOLAR",
     "nn.autoregressive": "Autoregressive",
     "nn.entries": "Entries",
+    "nn.feature_points": "FeaturePoints",
     "nn.heads": "Standard",
     "nn.latent": "Latent",
     "nn.mixture": "Mixture",

@@ -306,6 +306,12 @@ PRESETS: dict[tuple[str, str], Preset] = {
     # Three minutes on two cores.
     ("latent_mbrl", "PixelPendulum"): {"steps": 8_000},
     ("e2c", "PlanarNavigation"): {"steps": 6_000},
+    ("solar", "PixelDoubleIntegrator"): {
+        "steps": 10_560,
+        "learner": {
+            "network": {"class": "featurepoints", "channels": [16], "kernels": [3], "strides": [1]},
+        },
+    },
     ("planet", "PixelPendulumOneFrame"): {"steps": 4_000},
     ("planet", "PixelPendulum"): {"steps": 4_000},
     ("trpo", "CartPole-v1"): {"steps": 200_000, "num_envs": 8, "loop": {"unroll": 128}},

@@ -208,7 +208,7 @@ def algorithm_of(row: Row, env_name: str) -> rtg.Algorithm:
     learner = build(resolve(row.path), row.learner | simulated)
     env = rtg.make("FrozenLake-v1" if isinstance(learner, rtg.QLearning) else env_name, 2)
     if row.loop == "on_policy":
-        return rtg.OnPolicy(env, learner, unroll=8)
+        return rtg.OnPolicy(env, learner, unroll=learner.horizon if isinstance(learner, rtg.SOLAR) else 8)
     if row.loop == "asynchronous":
         return rtg.Asynchronous(env, learner, workers=2, unroll=4)
     if row.loop == "off_policy":

@@ -8,7 +8,7 @@ import pytest
 from algorithms_under_test import first_gradient, jit
 from rewardtogo.core import from_space
 from rewardtogo.nn import CNN, GRU, LSTM, MLP, Custom, Linear, Optimiser, as_network, flatten_observation, global_norm
-from rewardtogo.nn.network import _convolve
+from rewardtogo.nn.network import convolve
 
 KEY = jax.random.key(0)
 VECTOR = from_space(spaces.Box(-1, 1, (3,), np.float32))
@@ -203,7 +203,7 @@ def test_a_convolution_is_that_of_xla(shape, kernel, stride):
 
     def both(x, layer):
         square = lambda f: lambda x, layer: (f(x, layer) ** 2).sum()  # noqa: E731
-        ours = lambda x, layer: _convolve(x, layer, stride)  # noqa: E731
+        ours = lambda x, layer: convolve(x, layer, stride)  # noqa: E731
         return [(f(x, layer), jax.grad(square(f), (0, 1))(x, layer)) for f in (ours, theirs)]
 
     a, b = jax.jit(both)(x, layer)

@@ -6,7 +6,7 @@ r = -\tfrac12 \big(|p|^2 + q |v|^2 + \rho |u|^2\big),$$
 of the position, velocity and force before the move: linear dynamics (`dynamics`, `noise`) and quadratic cost (`cost`), so that the
 regulator of the state is exactly the best there is, and what a policy of pictures loses can be measured. The goal is the picture's middle.
 The velocity is in no single picture. There are no walls: a mass that leaves the picture is not seen until it comes back. It never
-terminates: `make` cuts after 25 steps.
+terminates: `make` cuts after 15 steps.
 """
 
 import equinox as eqx
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, UInt8
 
 from ..core import Action, Environment, Observation, PRNGKey, State, Timestep
 
-STEP = 0.2
+STEP = 0.4
 """h, in seconds."""
-NOISE = 0.01
+NOISE = 0.02
 """sigma: deviation of the noise on the velocity, in each step."""
 SPEED_PRICE, FORCE_PRICE = 0.1, 0.5
 """q and rho."""
@@ -28,9 +28,9 @@ MOST = 1.5
 """The largest force along each axis. The regulator's first force is less than the distance to the goal, and never comes to it."""
 START = 0.8
 """First positions are uniform within this of the goal, along each axis; first velocities are zero."""
-VIEW = 1.5
+VIEW = 2.0
 """The picture shows positions within this of the goal."""
-RADIUS = 0.3
+RADIUS = 0.4
 """Of the disc."""
 
 

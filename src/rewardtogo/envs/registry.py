@@ -53,7 +53,7 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "Tightrope": lambda: TabularEnv(tightrope()),
     "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
-    "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 25),
+    "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 15),
     "PlanarNavigation": lambda: TimeLimit(PlanarNavigation(), 40),
     "CartPoleSwingUp": lambda: TimeLimit(CartPoleSwingUp(), 100),
     "Obstacles": lambda: TimeLimit(Obstacles(), 100),

@@ -21,3 +21,4 @@ from .posteriors import Bootstrap as Bootstrap
 from .posteriors import Dropout as Dropout
 from .posteriors import MeanField as MeanField
 from .posteriors import Posterior as Posterior
+from .solar import SOLAR as SOLAR

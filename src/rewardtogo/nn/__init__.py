@@ -11,6 +11,8 @@ from .encoding import flat_size as flat_size
 from .encoding import flatten_observation as flatten_observation
 from .encoding import has_images as has_images
 from .entries import Entries as Entries
+from .feature_points import FeaturePoints as FeaturePoints
+from .feature_points import feature_points as feature_points
 from .heads import ACTION_KINDS as ACTION_KINDS
 from .heads import ActionHead as ActionHead
 from .heads import Head as Head

@@ -234,7 +234,7 @@ class CNNTorso(Torso):
         for stack, (name, _) in zip(self.stacks, self.images, strict=True):
             x = leaf(observation, name).astype(jnp.float32) / 255.0
             for layer, stride in zip(stack, self.strides, strict=True):
-                x = jax.nn.relu(_convolve(x, layer, stride))
+                x = jax.nn.relu(convolve(x, layer, stride))
             parts.append(x.ravel())
         x = jnp.concatenate(parts)
         for layer in self.layers:
@@ -242,7 +242,7 @@ class CNNTorso(Torso):
         return carry, x
 
 
-def _convolve(x: Float[Array, "H W C"], layer: Linear, stride: int) -> Float[Array, "H2 W2 D"]:
+def convolve(x: Float[Array, "H W C"], layer: Linear, stride: int) -> Float[Array, "H2 W2 D"]:
     """A convolution without padding, as one product of matrices.
 
     The picture is cut into cells of `stride` by `stride` pixels, whose pixels become channels; then the kernel moves by whole cells, and

@@ -56,7 +56,7 @@ def state_laws(
         return after, after
 
     start = (mean.astype(F.dtype), covariance.astype(F.dtype))
-    inputs = (F, f, noise, controller.K, controller.k, _spread(controller))
+    inputs = (F, f, noise, controller.K, controller.k, spread_of(controller))
     _, (means, covariances) = jax.lax.scan(step, start, inputs)
     join = lambda first, rest: jnp.concatenate([first[None], rest])  # noqa: E731
     return StateLaws(join(start[0], means), join(start[1], covariances))
@@ -71,7 +71,7 @@ def expected_cost(
 
     def one(t: Array) -> Array:
         _, _, C, c = problem.at(t)
-        K, spread = controller.K[t], _spread(controller)[t]
+        K, spread = controller.K[t], spread_of(controller)[t]
         m = jnp.concatenate([laws.mean[t], K @ laws.mean[t] + controller.k[t]])
         P = laws.covariance[t]
         cross = K @ P
@@ -103,12 +103,13 @@ def trajectory_kl(
         log_det = jnp.linalg.slogdet(relative @ relative.T)[1]
         return 0.5 * ((relative**2).sum() - len(k) - log_det + shift @ shift + ((gain @ P) * gain).sum())
 
-    old_parts = (old.K, old.k, _spread(old))
-    each = jax.vmap(one)(laws.mean[:-1], laws.covariance[:-1], new.K, new.k, _spread(new), *old_parts)
+    old_parts = (old.K, old.k, spread_of(old))
+    each = jax.vmap(one)(laws.mean[:-1], laws.covariance[:-1], new.K, new.k, spread_of(new), *old_parts)
     return each.sum()
 
 
-def _spread(controller: LinearController) -> Float[Array, "H U U"]:
+def spread_of(controller: LinearController) -> Float[Array, "H U U"]:
+    """Its noise; zeros where it has none."""
     if controller.spread is None:
         horizon, u, _ = controller.K.shape
         return jnp.zeros((horizon, u, u), controller.K.dtype)
@@ -138,7 +139,7 @@ def _whitened(problem: LQProblem, old: LinearController) -> _Whitened:
         shift = jnp.concatenate([jnp.zeros(x, F.dtype), k])
         return F @ T, f + F @ shift, T.T @ C @ T, T.T @ (c + C @ shift)
 
-    F, f, C, c = jax.vmap(one)(jnp.arange(problem.horizon), old.K, old.k, _spread(old))
+    F, f, C, c = jax.vmap(one)(jnp.arange(problem.horizon), old.K, old.k, spread_of(old))
     made = LQProblem(F, C, problem.horizon, f, c, problem.C_final, problem.c_final, problem.noise)
     size = jnp.abs(C).max() + jnp.abs(c).max() + jnp.abs(problem.C_final).max() + jnp.abs(problem.c_final).max()
     return _Whitened(made, jnp.where(size > 0, size, 1.0))
@@ -206,7 +207,7 @@ def _search(
     base, x = white.problem, problem.state_size
     u = problem.F.shape[-1] - x
     entropy = jnp.diag(jnp.concatenate([jnp.zeros(x), jnp.ones(u)])).astype(base.F.dtype)
-    white_noise = jnp.broadcast_to(jnp.eye(u, dtype=base.F.dtype), _spread(old).shape)
+    white_noise = jnp.broadcast_to(jnp.eye(u, dtype=base.F.dtype), spread_of(old).shape)
     still = LinearController(jnp.zeros_like(old.K), jnp.zeros_like(old.k), white_noise)
 
     def at(weight: Array) -> tuple[LinearController, Array]:
@@ -240,11 +241,11 @@ def _search(
     # A bound that even the least weight breaks leaves everything as it was.
     keep = kl <= epsilon
     new = jax.tree.map(lambda a, b: jnp.where(keep, a, b), new, still)
-    spread = _spread(old)
+    spread = spread_of(old)
     K = old.K + spread @ new.K
     k = old.k + jax.vmap(jnp.matmul)(spread, new.k)
     # A root of the new covariance that is triangular again.
-    roots = jax.vmap(lambda S: jnp.linalg.cholesky(S @ S.T))(spread @ _spread(new))
+    roots = jax.vmap(lambda S: jnp.linalg.cholesky(S @ S.T))(spread @ spread_of(new))
     return LinearController(K, k, roots), jnp.where(keep, kl, 0.0), jnp.where(keep, weight, 0.0)
 
 

@@ -20,7 +20,20 @@ from ..data.prioritised import PrioritisedReplay
 from ..data.replay import UniformReplay
 from ..envs.simulator import Simulator
 from ..model_based.posteriors import Bootstrap, Dropout, MeanField
-from ..nn import CNN, GRU, LSTM, MLP, Autoregressive, Entries, Latent, Mixture, Network, Stacked, Standard
+from ..nn import (
+    CNN,
+    GRU,
+    LSTM,
+    MLP,
+    Autoregressive,
+    Entries,
+    FeaturePoints,
+    Latent,
+    Mixture,
+    Network,
+    Stacked,
+    Standard,
+)
 from ..ops.schedules import parse_schedule, to_text
 from ..planning.mpc import (
     ILQR,
@@ -38,7 +51,7 @@ from ..value.outputs import C51, Expectation, Quantiles
 
 Module = TypeVar("Module")
 
-_NETWORKS = (MLP, CNN, GRU, LSTM, Stacked, Entries)
+_NETWORKS = (MLP, CNN, GRU, LSTM, Stacked, Entries, FeaturePoints)
 _HEADS = (Standard, Mixture, Autoregressive, Latent)
 _MEMORIES = (UniformReplay, PrioritisedReplay)
 _CHOICES = (Expectation, C51, Quantiles, EpsilonGreedy, Boltzmann, Greedy, Gaussian, OU, Sampled, Ascent, CEM)
