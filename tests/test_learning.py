@@ -66,6 +66,7 @@ CLAIMS = [
     Claim("ppo", "Pendulum-v1", 100_000, -200, seeds=4),
     Claim("ppo", "InvertedPendulum-v5", 100_000, 950, seeds=4),
     Claim("ppo", "CartPoleNoVel-v1", 300_000, 475, seeds=4),
+    Claim("ppo", "PendulumNoVel-v1", 500_000, -220, seeds=4),
     Claim("ddpg", "Pendulum-v1", 20_000, -200, seeds=4, items="6.25"),
     Claim("ddpg", "MountainCarContinuous-v0", 300_000, 92, seeds=4, items="6.26"),
     Claim("td3", "Pendulum-v1", 20_000, -200, seeds=4, items="6.28"),
