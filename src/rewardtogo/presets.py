@@ -50,6 +50,16 @@ _PPO_MUJOCO: Preset = {
         "normalise_observations": True,
     },
 }
+_CLONE: Preset = {
+    "steps": 20_000,
+    "learner": {
+        "learning_rate": "linear:1e-3:0",
+        "network": {"class": "mlp", "sizes": [256, 256]},
+        "normalise_observations": True,
+    },
+}
+# Twenty rounds of a thousand steps: as many gradient steps as for BC, and twice ten trajectories of labels.
+_DAGGER: Preset = {**_CLONE, "num_envs": 4, "loop": {"unroll": 250, "updates": 1000, "batch_size": 256}}
 _TANH_64 = {"class": "mlp", "sizes": [64], "activation": "tanh"}
 
 
@@ -60,6 +70,10 @@ def _dqn_cartpole(**learner: Any) -> Preset:
 
 PRESETS: dict[tuple[str, str], Preset] = {
     # Every one was found here; scores over seeds are in docs/results.md.
+    ("bc", "HalfCheetah-v5"): _CLONE,
+    ("bc", "Hopper-v5"): _CLONE,
+    ("dagger", "HalfCheetah-v5"): _DAGGER,
+    ("dagger", "Hopper-v5"): _DAGGER,
     ("ppo", "CartPole-v1"): {"steps": 100_000, "num_envs": 8, "loop": {"unroll": 128}, "learner": _PPO},
     # The decoder after the memory matters: without it no seed in three reached 500 while sampling its actions.
     ("ppo", "CartPoleNoVel-v1"): {
