@@ -1,5 +1,7 @@
 """Obstacles, Reacher and the swing-up of a cart-pole: dynamics against oracles in float64, and what a step gives."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,13 +51,13 @@ def test_moves_stop_at_walls_and_at_the_border():
         walls[:, :2] + RNG.uniform(0, 1, (6000, 2)) * (walls[:, 2:] - walls[:, :2]) + RNG.uniform(-0.1, 0.1, (6000, 2))
     )
     places[::2] = near[::2]
-    places = np.float32(places[[not touches(p, p) for p in places]][:4000])
-    moves = np.float32(RNG.uniform(-1.5, 1.5, places.shape))
+    places = places[[not touches(p, p) for p in places]][:4000].astype(np.float32)
+    moves = RNG.uniform(-1.5, 1.5, places.shape).astype(np.float32)
     moves[::50, 0], moves[1::50, 1] = 0.0, 0.0
-    goals = np.float32(RNG.uniform(-1, 1, places.shape))
+    goals = RNG.uniform(-1, 1, places.shape).astype(np.float32)
     after, timestep = ACROSS(jnp.asarray(np.hstack([places, goals])), jnp.asarray(moves))
-    wanted = np.clip(np.float64(places) + obstacles.STRIDE * np.clip(moves, -1, 1), -1, 1)
-    stopped = np.array([touches(a, b) for a, b in zip(np.float64(places), wanted, strict=True)])
+    wanted = np.clip(places.astype(float) + obstacles.STRIDE * np.clip(moves, -1, 1), -1, 1)
+    stopped = np.array([touches(a, b) for a, b in zip(places.astype(float), wanted, strict=True)])
     assert len(places) == 4000 and 200 < stopped.sum() < 2000 and (np.abs(wanted) == 1).any()
     assert np.allclose(after[:, :2], np.where(stopped[:, None], places, wanted), atol=1e-6)
     assert np.array_equal(after[:, 2:], goals) and np.array_equal(timestep.observation, after)
@@ -76,7 +78,7 @@ def test_the_straight_way_is_walled_up():
 # Reacher
 
 
-def tip_of_link(q: np.ndarray, share: float, link: int) -> tuple:
+def tip_of_link(q: Any, share: float, link: int) -> jax.Array:
     """A place on a link, as a function of the angles."""
     first, both = q[0], q[0] + q[1]
     if link == 0:
@@ -87,7 +89,7 @@ def tip_of_link(q: np.ndarray, share: float, link: int) -> tuple:
 
 def kinetic(q: jax.Array, spins: jax.Array) -> jax.Array:
     """Kinetic energy, from nothing but the mass along the rods: Gauss's rule of two points is exact for squares."""
-    total = 0.0
+    total = jnp.zeros((), q.dtype)
     for link in range(2):
         for share in (0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)):
             velocity = jax.jvp(lambda x, s=share, i=link: tip_of_link(x, s, i), (q,), (spins,))[1]

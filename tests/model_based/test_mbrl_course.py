@@ -17,6 +17,7 @@ from rewardtogo.core import Policy, env_spec
 from rewardtogo.envs import KnownModel, Obstacles, Reacher
 from rewardtogo.loops.collect import RandomPolicy, begin
 from rewardtogo.planning import MPC, ModelProblem
+from rewardtogo.runner.folder import RunFolder
 from rewardtogo.runner.plan import plan
 
 pytestmark = pytest.mark.slow
@@ -49,7 +50,7 @@ def test_what_is_learned_is_nearly_as_good_as_the_truth(
     began = time.process_time()
     runs = rtg.train("mbrl_v15", env, num_seeds=SEEDS, out=tmp_path / "run", quiet=True)
     seconds = (time.process_time() - began) / SEEDS
-    assert all(run.config["iterations"] <= iterations for run in runs)
+    assert all(RunFolder(run.path).config()["iterations"] <= iterations for run in runs)
     returns = [run.evaluation["return_mean"] for run in runs]
     scores = sorted((found - random) / (best - random) for found in returns)
     print(
