@@ -102,6 +102,9 @@ def main() -> int:
     if slow:
         store(rows)
         return status
+    if not rows:
+        print("no test recorded anything: the page stays as it was", file=sys.stderr)
+        return status or 1
     write(rows + (json.loads(STORED.read_text()) if STORED.exists() else []))
     return status
 
