@@ -160,6 +160,8 @@ def test_controllers_are_recovered_from_what_they_did(start):
 
 
 def test_refusals():
+    with pytest.raises(ValueError, match="SOLAR chooses box actions, and this environment wants discrete ones"):
+        SOLAR().init(rtg.core.env_spec(rtg.make("CartPole-v1", 1)), jax.random.key(0))
     with pytest.raises(ValueError, match="without a memory"):
         SOLAR(network=rtg.GRU(4))
     learner = small(episodes=3)

@@ -41,6 +41,7 @@ from ..core import (
     Spec,
     number,
     part,
+    require_action,
     setting,
 )
 from ..nn import MLP, Linear, Network, Optimiser, RunningNorm, as_network, flat_size, flatten_observation
@@ -262,6 +263,7 @@ class SOLAR(Learner):
         return Laws.of(mean, jnp.eye(size + actions + 1), 0.1 * jnp.eye(size), size + 2.0)
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> SOLARState:
+        require_action("SOLAR", spec, self.action_kinds)
         actions, size, horizon = spec.action.size, self.latent_size, self.horizon
         keys = jax.random.split(key, 4)
         encoder = self.network.build(spec.observation, keys[0])
