@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from ..core import Carry, Observation, PRNGKey, Spec
 from .encoding import flat_size, flatten_part, has_images, input_parts, leaf
-from .network import CNN, Linear, Network, Torso, convolve
+from .network import CNN, Linear, Network, Torso, convolve, joined
 
 
 class FeaturePoints(Network):
@@ -102,7 +102,4 @@ class FeaturePointsTorso(Torso):
             for j, (layer, stride) in enumerate(zip(stack, self.strides, strict=True)):
                 x = convolve(x if j == 0 else jax.nn.relu(x), layer, stride)
             parts.append(feature_points(x, self.sharpness[i]).ravel())
-        x = jnp.concatenate(parts)
-        for layer in self.layers:
-            x = jax.nn.relu(layer(x))
-        return carry, x
+        return carry, joined(parts, self.layers)

@@ -8,7 +8,7 @@ learner serves both kinds.
 import inspect
 import itertools
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -236,10 +236,15 @@ class CNNTorso(Torso):
             for layer, stride in zip(stack, self.strides, strict=True):
                 x = jax.nn.relu(convolve(x, layer, stride))
             parts.append(x.ravel())
-        x = jnp.concatenate(parts)
-        for layer in self.layers:
-            x = jax.nn.relu(layer(x))
-        return carry, x
+        return carry, joined(parts, self.layers)
+
+
+def joined(parts: Sequence[Float[Array, "_"]], layers: tuple[Linear, ...]) -> Float[Array, "F"]:
+    """Parts of an observation side by side, through dense layers with ReLU."""
+    x = jnp.concatenate(parts)
+    for layer in layers:
+        x = jax.nn.relu(layer(x))
+    return x
 
 
 def convolve(x: Float[Array, "H W C"], layer: Linear, stride: int) -> Float[Array, "H2 W2 D"]:
