@@ -11,7 +11,8 @@ class Row:
     """One algorithm: where its learner lives, which loop runs it, where the notes have it, and what it can act in.
 
     Several algorithms may be settings of one learner: `learner`, `loop_options` and `num_envs` are what a row sets, unless the user does.
-    `eval_episodes`: of an evaluation, where the usual number would take longer than the training (policies that plan).
+    `eval_episodes`: of an evaluation, where the usual number would take longer than the training (policies that plan), or where
+    acting is the least of the training, whatever it acts in (DAgger).
     """
 
     name: str
@@ -59,6 +60,7 @@ ALGORITHMS: dict[str, Row] = {
             "Alg 1",
             ANY,
             "dataset aggregation: an expert labels the states that the learner comes to",
+            eval_episodes=20,
         ),
         Row(
             "dart",
@@ -70,6 +72,7 @@ ALGORITHMS: dict[str, Row] = {
             "an expert who drives with as much noise as the learner has error, so that it shows the way back",
             {},
             {"beta": 1.0, "noise": 0.1, "adapt_noise": True},
+            eval_episodes=20,
         ),
         Row(
             "reinforce",

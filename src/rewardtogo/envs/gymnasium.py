@@ -188,13 +188,14 @@ class GymnasiumEnv(VectorEnv):
         if isinstance(env, vector.VectorEnv):
             envs = _foreign(env, num_envs, kwargs)
             name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+            limit = None if env.spec is None else env.spec.max_episode_steps
         else:
             envs = own = _own(env, 1 if num_envs is None else num_envs, kwargs, asynchronous, (MASK, *extras))
-            name = own.call("title")[0]
+            name, limit = own.call("title")[0], own.call("time_limit")[0]
         for space in (envs.single_observation_space, envs.single_action_space):
             from_space(space)
         mask = _mask_size(name, envs, mask_from_info)
-        self.host = Host(name, envs, mask, tuple(extras))
+        self.host = Host(name, envs, mask, tuple(extras), limit)
 
     @property
     def name(self) -> str:
@@ -209,6 +210,11 @@ class GymnasiumEnv(VectorEnv):
     def backend(self) -> str:
         """Whose environments these are: `"envpool"` for EnvPool's, `"gymnasium"` for all others."""
         return "envpool" if isinstance(self.host.envs.unwrapped, EnvPool) else "gymnasium"
+
+    @property
+    def time_limit(self) -> int | None:
+        """Steps after which an episode is cut, where the environment's registration says so."""
+        return self.host.time_limit
 
     @property
     def observation_space(self) -> spaces.Space:

@@ -33,10 +33,18 @@ class Host:
 
     - `mask`: the number of discrete actions, where `info` says which of them are allowed; otherwise 0.
     - `extras`: names of numbers in `info` that are handed on.
+    - `time_limit`: steps after which an episode is cut, where that is known.
     """
 
-    def __init__(self, name: str, envs: vector.VectorEnv, mask: int = 0, extras: tuple[str, ...] = ()) -> None:
-        self.name, self.envs, self.mask, self.extras = name, envs, mask, extras
+    def __init__(
+        self,
+        name: str,
+        envs: vector.VectorEnv,
+        mask: int = 0,
+        extras: tuple[str, ...] = (),
+        time_limit: int | None = None,
+    ) -> None:
+        self.name, self.envs, self.mask, self.extras, self.time_limit = name, envs, mask, extras, time_limit
         self.size = envs.num_envs
         self.same_step = envs.metadata["autoreset_mode"] == vector.AutoresetMode.SAME_STEP
         # Gymnasium prints a worker's traceback once for each copy; what it raises afterwards says the same.

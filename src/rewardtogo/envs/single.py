@@ -20,9 +20,9 @@ def title(env: gymnasium.Env) -> str:
 def single(env: Any, kwargs: dict[str, Any], keep: tuple[str, ...]) -> Callable[[], gymnasium.Env]:
     """A function that makes the environment of an id or a maker, or hands out one that exists already.
 
-    What it makes names itself (`title`), says in words what is wrong with an observation's shape, and passes on only
-    the entries `keep` of `info`: other entries need not be alike in all copies, and Gymnasium's vector environments
-    fail where they are not.
+    What it makes names itself (`title`), knows its `time_limit`, says in words what is wrong with an observation's
+    shape, and passes on only the entries `keep` of `info`: other entries need not be alike in all copies, and
+    Gymnasium's vector environments fail where they are not.
     """
     # Only modules and plain values below, and the class inside: so the function is pickled by value, and a worker
     # process imports neither this library nor JAX, which take seconds each.
@@ -42,6 +42,9 @@ def single(env: Any, kwargs: dict[str, Any], keep: tuple[str, ...]) -> Callable[
         class Lean(gym.Wrapper):
             def title(self):
                 return self.env.spec.id if self.env.spec is not None else type(self.env.unwrapped).__name__
+
+            def time_limit(self):
+                return None if self.env.spec is None else self.env.spec.max_episode_steps
 
             def reset(self, *, seed=None, options=None):
                 observation, info = self.env.reset(seed=seed, options=options)

@@ -33,6 +33,9 @@ DEFAULT_STEPS = 100_000
 MOST_ITERATIONS, MOST_HOSTED = 2**31 - 1, 10_000
 ROWS, EVALUATIONS, EVAL_EPISODES = 200, 10, 20
 """How many rows of metrics and how many evaluations a run has, about, and episodes an evaluation."""
+HOSTED_SHARE, HOSTED_LEAST, HOSTED_EPISODE = 0.2, 2, 1000
+"""Where environments live outside of the compiled program: the steps that evaluations on the way may take, in steps of the training; the
+fewest episodes of one; and the length of an episode where nobody says it. A step out there costs as much as one of training."""
 
 
 @dataclasses.dataclass
@@ -78,7 +81,6 @@ def plan(
     env_name = env if isinstance(env, str) else _title(env)
     ready = _preset(preset, name, env_name)
     known_row = ALGORITHMS.get(name)
-    eval_episodes = eval_episodes or (known_row and known_row.eval_episodes) or EVAL_EPISODES
     env_kwargs = merge(ready.get("env", {}), env_kwargs or {})
     check_budget(steps, seed)
     _check_num_envs(num_envs, env, backend, env_kwargs)
@@ -129,6 +131,7 @@ def plan(
             whole = build(cls, options, env=vector_env, learner=inner, **more)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
     iterations = _iterations(whole, steps)
+    eval_episodes = eval_episodes or (known_row and known_row.eval_episodes) or _episodes(whole, steps, evaluations)
     row_every = max(1, iterations // ROWS)
     eval_every = max(1, round(iterations / max(1, evaluations) / row_every)) * row_every
     whole = whole.with_horizon(iterations)
@@ -204,6 +207,16 @@ def from_config(
         config |= {"iterations": iterations, "steps": steps_after(whole, iterations)}
     eval_env = _evaluation_env(source, vector_env, backend, described["kwargs"], config["eval_episodes"])
     return Plan(whole, inner, vector_env, eval_env, config)
+
+
+def _episodes(whole: Algorithm, steps: int, evaluations: int) -> int:
+    """Of an evaluation, of the policy at its best and as it explores each: as many as suit what is acted in for `steps` steps."""
+    doors = hosted(_env_of(whole))
+    if not doors:
+        return EVAL_EPISODES
+    length = doors[0].time_limit or HOSTED_EPISODE
+    fitting = int(HOSTED_SHARE * steps / (2 * max(1, evaluations) * length))
+    return min(EVAL_EPISODES, max(HOSTED_LEAST, fitting))
 
 
 def _dataset(data: Any) -> Dataset:
