@@ -315,7 +315,7 @@ def _split(leaves: list[Any]) -> tuple[list[Any], list[Any]]:
     return [x for x in leaves if _is_large(x)], [x for x in leaves if not _is_large(x)]
 
 
-def _places(arguments: tuple[list[Array], Array]) -> Any:
+def _places(arguments: tuple[list[Any], Any]) -> Any:
     """Where a chunk puts what it gives back: where it got it from, so that the next call takes it as it is. None on one device."""
     mesh = jax.sharding.get_mesh()
     if mesh.empty:
