@@ -15,7 +15,8 @@ from rewardtogo.core import MASK
 from rewardtogo.envs.pendulum import Pendulum
 from rewardtogo.policy_gradient.fisher import mean_kl
 from rewardtogo.policy_gradient.fit import action_laws, actor_parameters, critic, samples_of
-from rewardtogo.policy_gradient.npg import NPG, NPGState
+from rewardtogo.policy_gradient.natural import NaturalState
+from rewardtogo.policy_gradient.npg import NPG
 from rewardtogo.policy_gradient.trpo import TRPO, line_search
 
 KEY = jax.random.key(0)
@@ -139,7 +140,7 @@ def test_a_whole_step_is_the_natural_gradient(item):
     update = lambda learner, s: jit(lambda s, r: learner.update(s, r, KEY))(s, rollout)[:2]  # noqa: E731
     options = {"network": small, "value_epochs": 1, "gamma": 0.97, "gae_lambda": 0.9}
     trpo, metrics = update(make(target_kl=1e-3), state)
-    npg, _ = update(NPG(**options, kl_step=1e-3), NPGState(state.network, state.optimiser, None, state.updates))
+    npg, _ = update(NPG(**options, kl_step=1e-3), NaturalState(state.network, state.optimiser, None, state.updates))
     assert float(metrics["step_fraction"]) == 1.0
     ppo_learner = rtg.PPO(network=small, epochs=1, minibatches=1, gamma=0.97, gae_lambda=0.9)
     fresh = ppo_learner.init(rtg.core.env_spec(ENV), KEY)

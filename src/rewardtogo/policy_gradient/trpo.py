@@ -22,25 +22,12 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-from ..core import EnvSpec, Learner, Number, PRNGKey, Rollout, number, part, require_action, setting
-from ..nn import (
-    ACTION_KINDS,
-    MLP,
-    ActorCritic,
-    ActorCriticPolicy,
-    Network,
-    Optimiser,
-    RunningNorm,
-    as_network,
-    global_norm,
-    require_fresh,
-)
-from ..ops.metrics import explained_variance
-from .fisher import mean_kl, natural_gradient, step_size
-from .fit import action_laws, actor_parameters, critic, fit_values, mean_entropy, samples_of, surrogate, thin
+from ..core import Number, number, setting
+from ..ops.distributions import Distribution
+from .fisher import NaturalGradient, mean_kl, step_size
+from .natural import Natural, Vector
 
 
 class Search(eqx.Module):
@@ -87,116 +74,38 @@ def line_search(
     return jax.lax.while_loop(lambda search: ~search.accepted & (search.tries < tries), attempt, start)
 
 
-class TRPOState(eqx.Module):
-    """Networks, the value function's optimiser, what observations look like, and the number of updates done."""
-
-    network: ActorCritic
-    optimiser: optax.OptState
-    norm: RunningNorm | None
-    updates: Int[Array, ""]
-
-
-class TRPO(Learner):
+class TRPO(Natural):
     """Trust region policy optimisation. Any action space but dictionaries; any observation; networks with or without a memory."""
 
-    network: Network = part(MLP(64, 64), "recipe of the actor's and of the critic's network", converter=as_network)
     target_kl: Number = number(0.01, "eps: greatest mean KL divergence of a step", above=0)
-    gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
-    gae_lambda: Number = number(
-        0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1
-    )
-    entropy_cost: Number = number(0.0, "c_H: weight of an entropy bonus in the surrogate", at_least=0)
-    damping: Number = number(0.1, "xi: multiple of the identity added to the Fisher matrix", at_least=0)
-    cg_iterations: int = setting(10, "iterations of conjugate gradients", at_least=1)
-    fisher_every: int = setting(
-        1,
-        "1 estimates the Fisher matrix from all samples, k from every k-th time step, with a memory sequence",
-        at_least=1,
-    )
     shrink: Number = number(0.8, "what a step that fails is multiplied by", above=0, below=1)
     line_search_steps: int = setting(10, "lengths that are tried before the step is given up", at_least=1)
     kl_direction: Literal["old_new", "new_old"] = setting(
         "old_new", "KL(old || new), or KL(new || old)", choices=("old_new", "new_old")
     )
-    value_learning_rate: Number = number(1e-3, "Adam's step size for the value function", above=0)
-    value_epochs: int = setting(10, "passes of the value regression over each rollout", at_least=1)
-    minibatches: int = setting(
-        4, "steps of the regression a pass; with a memory each takes whole sequences", at_least=1
-    )
-    bptt: int = setting(
-        32, "steps that gradients flow back through a memory: rollouts are cut into such pieces", at_least=1
-    )
-    max_grad_norm: Number = number(10.0, "gradients of the value loss are scaled down to this norm", above=0)
-    normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
-    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
-    normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
-    @property
-    def batch(self) -> Literal["rollout"]:
-        return "rollout"
+    def _step(
+        self,
+        theta: Vector,
+        natural: NaturalGradient,
+        laws: Callable[[Vector], Distribution],
+        objective: Callable[[Distribution], Float[Array, ""]],
+    ) -> tuple[Vector, dict[str, Array]]:
+        old = laws(theta)
 
-    @property
-    def action_kinds(self) -> tuple[str, ...]:
-        return ACTION_KINDS
-
-    def init(self, spec: EnvSpec, key: PRNGKey) -> TRPOState:
-        require_action("TRPO", spec, self.action_kinds)
-        network = ActorCritic.of(self.network, spec, key, log_std=self.at(0).log_std)
-        norm = RunningNorm.of(spec.observation) if self.normalise_observations else None
-        return TRPOState(network, self._optimiser().init(critic(network)), norm, jnp.zeros((), jnp.int32))
-
-    def policy(self, state: TRPOState, explore: bool) -> ActorCriticPolicy:
-        return ActorCriticPolicy(state.network, state.norm, explore, state.updates)
-
-    def update(self, state: TRPOState, batch: Rollout, key: PRNGKey) -> tuple[TRPOState, dict[str, Array], tuple[()]]:
-        require_fresh(batch.transitions, state.updates, "TRPO")
-        now = self.at(state.updates)
-        samples = samples_of(
-            state.network, state.norm, batch, now.gamma, now.gae_lambda, self.normalise_advantages, self.bptt
-        )
-        few = thin(samples, batch.transitions.reward.shape[1], self.fisher_every)
-        theta, network_of = actor_parameters(state.network)
-        old = action_laws(state.network, samples)
-        natural = natural_gradient(
-            lambda theta: surrogate(action_laws(network_of(theta), samples), samples, now.entropy_cost),
-            lambda theta: action_laws(network_of(theta), few),
-            theta,
-            now.damping,
-            self.cg_iterations,
-        )
-
-        def evaluate(theta: Float[Array, "P"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-            new = action_laws(network_of(theta), samples)
+        def evaluate(theta: Vector) -> tuple[Float[Array, ""], Float[Array, ""]]:
+            new = laws(theta)
             pair = (old, new) if self.kl_direction == "old_new" else (new, old)
-            return surrogate(new, samples, now.entropy_cost), mean_kl(*pair)
+            return objective(new), mean_kl(*pair)
 
-        step = step_size(natural.curvature, now.target_kl) * natural.direction
+        step = step_size(natural.curvature, self.target_kl) * natural.direction
         search = line_search(
-            evaluate, theta, step, natural.objective, now.target_kl, now.shrink, self.line_search_steps
+            evaluate, theta, step, natural.objective, self.target_kl, self.shrink, self.line_search_steps
         )
-        network, optimiser, value_loss = fit_values(
-            network_of(search.parameters),
-            state.optimiser,
-            now._optimiser(),
-            samples,
-            key,
-            self.value_epochs,
-            self.minibatches,
-        )
-        # Statistics change after the update, so that the ratio starts at exactly 1.
-        norm = None if state.norm is None else state.norm.update(batch.transitions.observation)
-        metrics = {
+        return search.parameters, {
             "kl": search.kl,
             "improvement": search.improvement,
             "step_fraction": search.fraction,
             "line_search_steps": search.tries.astype(theta.dtype),
             "accepted": search.accepted.astype(theta.dtype),
-            "entropy": mean_entropy(old),
-            "grad_norm": global_norm(natural.gradient),
-            "value_loss": value_loss,
-            "explained_variance": explained_variance(samples.value, samples.target),
         }
-        return TRPOState(network, optimiser, norm, state.updates + 1), metrics, ()
-
-    def _optimiser(self) -> Optimiser:
-        return Optimiser(self.value_learning_rate, self.max_grad_norm)
