@@ -11,16 +11,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
-from ..core import EnvSpec, Learner, Number, PRNGKey, Rollout, number, part, require_action, setting
+from ..core import EnvSpec, Learner, Number, PRNGKey, Rollout, require_action
 from ..nn import (
     ACTION_KINDS,
-    MLP,
     ActorCritic,
     ActorCriticPolicy,
     Network,
     Optimiser,
     RunningNorm,
-    as_network,
     global_norm,
     require_fresh,
 )
@@ -42,33 +40,23 @@ class NaturalState(eqx.Module):
 
 
 class Natural(Learner):
-    """A learner that steps along the natural gradient; `_step` says how far."""
+    """A learner that steps along the natural gradient; `_step` says how far. What the fields are, each of them says itself."""
 
-    network: Network = part(MLP(64, 64), "recipe of the actor's and of the critic's network", converter=as_network)
-    gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
-    gae_lambda: Number = number(
-        0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1
-    )
-    entropy_cost: Number = number(0.0, "c_H: weight of an entropy bonus in the surrogate", at_least=0)
-    damping: Number = number(0.1, "xi: multiple of the identity added to the Fisher matrix", at_least=0)
-    cg_iterations: int = setting(10, "iterations of conjugate gradients", at_least=1)
-    fisher_every: int = setting(
-        1,
-        "1 estimates the Fisher matrix from all samples, k from every k-th time step, with a memory sequence",
-        at_least=1,
-    )
-    value_learning_rate: Number = number(1e-3, "Adam's step size for the value function", above=0)
-    value_epochs: int = setting(10, "passes of the value regression over each rollout", at_least=1)
-    minibatches: int = setting(
-        4, "steps of the regression a pass; with a memory each takes whole sequences", at_least=1
-    )
-    bptt: int = setting(
-        32, "steps that gradients flow back through a memory: rollouts are cut into such pieces", at_least=1
-    )
-    max_grad_norm: Number = number(10.0, "gradients of the value loss are scaled down to this norm", above=0)
-    normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
-    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
-    normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
+    network: eqx.AbstractVar[Network]
+    gamma: eqx.AbstractVar[Number]
+    gae_lambda: eqx.AbstractVar[Number]
+    entropy_cost: eqx.AbstractVar[Number]
+    damping: eqx.AbstractVar[Number]
+    cg_iterations: eqx.AbstractVar[int]
+    fisher_every: eqx.AbstractVar[int]
+    value_learning_rate: eqx.AbstractVar[Number]
+    value_epochs: eqx.AbstractVar[int]
+    minibatches: eqx.AbstractVar[int]
+    bptt: eqx.AbstractVar[int]
+    max_grad_norm: eqx.AbstractVar[Number]
+    normalise_advantages: eqx.AbstractVar[bool]
+    log_std: eqx.AbstractVar[Number]
+    normalise_observations: eqx.AbstractVar[bool]
 
     @property
     def batch(self) -> Literal["rollout"]:

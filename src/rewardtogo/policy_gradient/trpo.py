@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-from ..core import Number, number, setting
+from ..core import Number, number, part, setting
+from ..nn import MLP, Network, as_network
 from ..ops.distributions import Distribution
 from .fisher import NaturalGradient, mean_kl, step_size
 from .natural import Natural, Vector
@@ -77,12 +78,37 @@ def line_search(
 class TRPO(Natural):
     """Trust region policy optimisation. Any action space but dictionaries; any observation; networks with or without a memory."""
 
+    network: Network = part(MLP(64, 64), "recipe of the actor's and of the critic's network", converter=as_network)
     target_kl: Number = number(0.01, "eps: greatest mean KL divergence of a step", above=0)
     shrink: Number = number(0.8, "what a step that fails is multiplied by", above=0, below=1)
     line_search_steps: int = setting(10, "lengths that are tried before the step is given up", at_least=1)
     kl_direction: Literal["old_new", "new_old"] = setting(
         "old_new", "KL(old || new), or KL(new || old)", choices=("old_new", "new_old")
     )
+    gamma: Number = number(0.99, "discount", at_least=0, at_most=1)
+    gae_lambda: Number = number(
+        0.95, "weight of long returns in GAE: 0 is the TD error, 1 is Monte Carlo", at_least=0, at_most=1
+    )
+    entropy_cost: Number = number(0.0, "c_H: weight of an entropy bonus in the surrogate", at_least=0)
+    damping: Number = number(0.1, "xi: multiple of the identity added to the Fisher matrix", at_least=0)
+    cg_iterations: int = setting(10, "iterations of conjugate gradients", at_least=1)
+    fisher_every: int = setting(
+        1,
+        "1 estimates the Fisher matrix from all samples, k from every k-th time step, with a memory sequence",
+        at_least=1,
+    )
+    value_learning_rate: Number = number(1e-3, "Adam's step size for the value function", above=0)
+    value_epochs: int = setting(10, "passes of the value regression over each rollout", at_least=1)
+    minibatches: int = setting(
+        4, "steps of the regression a pass; with a memory each takes whole sequences", at_least=1
+    )
+    bptt: int = setting(
+        32, "steps that gradients flow back through a memory: rollouts are cut into such pieces", at_least=1
+    )
+    max_grad_norm: Number = number(10.0, "gradients of the value loss are scaled down to this norm", above=0)
+    normalise_advantages: bool = setting(True, "mean 0, sd 1 over the rollout")
+    log_std: Number = number(0.0, "log standard deviation that a Gaussian policy begins with, in units of half the box")
+    normalise_observations: bool = setting(False, "standardise observations by running statistics kept in the state")
 
     def _step(
         self,
