@@ -41,8 +41,11 @@ class Corridor(gymnasium.Env):
 gymnasium.register("Corridor-v0", Corridor, max_episode_steps=100)
 
 
-class Drift(rtg.Environment):
-    """A point on a line that drifts at random; the action is a push, the cost the squared distance from 0."""
+class Drift(rtg.Drawn):
+    """A point on a line that drifts at random; the action is a push, the cost the squared distance from 0.
+
+    `rtg.Environment` is the base of those that are not to be shown.
+    """
 
     noise: float = 0.1
 
@@ -69,3 +72,11 @@ class Drift(rtg.Environment):
             final_observation=place,
             extras={},
         )
+
+    def render(self, state, earlier=()):
+        """A line from -3 to 3 and the point, for `rtg play`: plain NumPy, never compiled."""
+        picture = np.full((60, 420, 3), 255, np.uint8)
+        picture[29:31], picture[20:40, 209:211] = 150, 150
+        column = int(np.clip(70 * (float(state[0]) + 3.0), 5, 414))
+        picture[25:35, column - 5 : column + 5] = (0, 114, 178)
+        return picture

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .core import Algorithm as Algorithm
     from .core import Batch as Batch
     from .core import Configured as Configured
+    from .core import Drawn as Drawn
     from .core import Environment as Environment
     from .core import EnvSpec as EnvSpec
     from .core import Learner as Learner
@@ -95,8 +96,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "actor_critic.asynchronous": "Asynchronous",
-    "core": "Algorithm Batch Configured Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition VectorEnv "
-    "number part setting",
+    "core": "Algorithm Batch Configured Drawn Environment EnvSpec Learner Model Policy Rollout Solution Spec Timestep Transition "
+    "VectorEnv number part setting",
     "data.prioritised": "PrioritisedReplay",
     "data.replay": "Replay UniformReplay",
     "envs.gymnasium": "EnvironmentFailure GymnasiumEnv",

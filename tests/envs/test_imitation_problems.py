@@ -97,7 +97,7 @@ def test_the_light_shows_the_last_action_and_nothing_else(key):
             state, _ = now
             action = jax.random.bernoulli(keys[0]).astype(jnp.int32)
             state, timestep = env.step(state, action, keys[1])
-            return (state, timestep.observation), (action, timestep.reward, now[0][0], timestep.observation)
+            return (state, timestep.observation), (action, timestep.reward, now[0].obstacle, timestep.observation)
 
         return jax.lax.scan(step, env.reset(key), jax.random.split(key, (5000, 2)))[1]
 

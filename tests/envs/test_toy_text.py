@@ -12,6 +12,7 @@ from scipy import stats
 import rewardtogo as rtg
 from algorithms_under_test import jit
 from rewardtogo.core import MASK, from_space
+from rewardtogo.envs.drawing import Pictured
 from rewardtogo.envs.sparse import SparseEnv
 from rewardtogo.envs.time_limit import TimeLimit
 from rewardtogo.envs.toy_text import LIMIT, TABULAR, gymnasium_table, table_mdp, toy_text
@@ -53,7 +54,8 @@ def test_spaces_limit_and_mask(name, kwargs):
     assert isinstance(made, TimeLimit) and made.max_steps == (limit or LIMIT)
     if name == "Taxi-v4":
         env: Any = gymnasium.make(name, **kwargs).unwrapped
-        inner = made.env
+        assert isinstance(made.env, Pictured)
+        inner = made.env.env
         assert isinstance(inner, SparseEnv) and inner.masks is not None
         np.testing.assert_array_equal(inner.masks, [env.action_mask(s) for s in range(500)])
 

@@ -1,7 +1,6 @@
 """The drone and the tree (figure 2.3): an expert who goes left or right, and what each head makes of it."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from imitating import flights, run
@@ -55,5 +54,6 @@ def test_the_expert_never_hits(key):
     assert not np.any(jax.vmap(DRONE.hits)(t.observation, t.action))
     offset = np.asarray(t.action - t.observation)[:, 0]
     assert 0.45 < (offset > 0).mean() < 0.55 and np.abs(np.abs(offset).mean() - SIDE) < 0.01
-    _, timestep = DRONE.step(jnp.zeros(1), jnp.zeros(1), key)
+    state, place = DRONE.reset(key)
+    _, timestep = DRONE.step(state, place, key)
     assert float(timestep.reward) == -1.0 and bool(timestep.terminated)

@@ -9,6 +9,7 @@ from .fields import part as part
 from .fields import setting as setting
 from .protocols import Algorithm as Algorithm
 from .protocols import Choices as Choices
+from .protocols import Drawn as Drawn
 from .protocols import Dynamics as Dynamics
 from .protocols import Environment as Environment
 from .protocols import Game as Game

@@ -5,13 +5,14 @@ trains. Every method is pure, of fixed shape, and can be compiled, scanned and m
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx
 import gymnasium.spaces as spaces
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt8
 
 from .fields import Configured
 from .spec import EnvSpec, from_space
@@ -46,6 +47,14 @@ class Observed(Environment):
     @abstractmethod
     def state_of(self, observation: Observation) -> State:
         """The state that looks like this."""
+
+
+class Drawn(Environment):
+    """An environment with a picture, for those who watch it (`rtg play`, `rtg label`). Never part of a compiled program."""
+
+    @abstractmethod
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"] | None:
+        """What a state looks like; `earlier` are those before it in the episode, of which a path can be drawn. None: it cannot be drawn."""
 
 
 class Dynamics(eqx.Module):

@@ -7,6 +7,7 @@ from .cartpole import CartPole as CartPole
 from .cartpole_swing_up import CartPoleSwingUp as CartPoleSwingUp
 from .catch import Catch as Catch
 from .check import check_env as check_env
+from .drawing import Pictured as Pictured
 from .gymnasium import EnvironmentFailure as EnvironmentFailure
 from .gymnasium import GymnasiumEnv as GymnasiumEnv
 from .history import DiscreteHistory as DiscreteHistory

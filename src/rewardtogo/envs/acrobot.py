@@ -5,15 +5,16 @@ Gymnasium's Acrobot-v1, the equations those of Sutton and Barto's book, integrat
 Reward -1 a step, and 0 for the one that gets there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
+from .canvas import BLUE, GREEN, INK, SKY, Canvas
 
 GRAVITY = 9.8
 LINK_MASS = 1.0
@@ -26,7 +27,7 @@ MAX_SPIN_2 = 9 * np.pi
 TIP_HEIGHT = 1.0
 
 
-class Acrobot(Observed):
+class Acrobot(Observed, Drawn):
     """Two links. Actions: torque -1, 0, 1.
 
     - State: two angles (rad, 0 hanging, the second relative to the first), two angular velocities (rad/s).
@@ -57,6 +58,14 @@ class Acrobot(Observed):
         reward = terminated.astype(state.dtype) - 1.0
         observation = observe(state)
         return state, Timestep(observation, reward, terminated, jnp.zeros((), bool), observation, {})
+
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The line is the height that the tip is to reach."""
+        del earlier
+        angles, sheet = np.cumsum([float(v) for v in state[:2]]), Canvas((-2.2, -2.2), (2.2, 2.2))
+        sheet.line([(-2.2, TIP_HEIGHT), (2.2, TIP_HEIGHT)], 0.03, GREEN)
+        draw_links(sheet, LINK_LENGTH * np.stack([np.sin(angles), -np.cos(angles)], 1), 0.2)
+        return sheet.picture()
 
 
 def observe(state: Float[Array, "4"]) -> Float[Array, "6"]:
@@ -102,3 +111,12 @@ def runge_kutta(
     again = derivative(state + duration / 2 * middle)
     end = derivative(state + duration * again)
     return state + duration / 6 * (start + 2 * middle + 2 * again + end)
+
+
+def draw_links(sheet: Canvas, links: Float[np.ndarray, "2 2"], width: float) -> None:
+    """Two links from the origin, either by the way along it."""
+    joints = np.concatenate([np.zeros((1, 2)), np.cumsum(links, 0)])
+    sheet.line(joints[:2], width, BLUE)
+    sheet.line(joints[1:], width, SKY)
+    for joint in joints[:2]:
+        sheet.disc(joint, 0.3 * width, INK)

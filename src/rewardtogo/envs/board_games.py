@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int8, UInt8
 
 from ..core import MASK, Action, Game, Observation, PRNGKey, State
+from .canvas import BLUE, ORANGE, PAPER, STONE, Canvas
 
 Bits = Array
 """The squares that somebody's stones are on, as the game packs them."""
@@ -60,6 +61,10 @@ class LineGame(Game):
     @abstractmethod
     def pack(self, squares: Int8[Array, "H W"]) -> Bits:
         """The inverse of `unpack`."""
+
+    @abstractmethod
+    def draw(self, own: Int8[np.ndarray, "H W"], other: Int8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "X Y 3"]:
+        """A picture of two players' stones, the first one's blue."""
 
     @property
     def observation_space(self) -> spaces.Space:
@@ -131,6 +136,20 @@ class TicTacToe(LineGame):
     def pack(self, squares: Int8[Array, "H W"]) -> Bits:
         return (squares.reshape(-1).astype(jnp.int32) << jnp.arange(9)).sum(dtype=jnp.int32)
 
+    def draw(self, own: Int8[np.ndarray, "H W"], other: Int8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "X Y 3"]:
+        """Crosses are `own`, rings the other's; row 0 is the highest."""
+        sheet = Canvas((-0.1, -0.1), (3.1, 3.1))
+        for edge in (1, 2):
+            sheet.line([(edge, 0), (edge, 3)], 0.05, STONE)
+            sheet.line([(0, edge), (3, edge)], 0.05, STONE)
+        for row, column in np.argwhere(own):
+            x, y = column + 0.5, 2.5 - row
+            sheet.line([(x - 0.27, y - 0.27), (x + 0.27, y + 0.27)], 0.14, BLUE)
+            sheet.line([(x - 0.27, y + 0.27), (x + 0.27, y - 0.27)], 0.14, BLUE)
+        for row, column in np.argwhere(other):
+            sheet.disc((column + 0.5, 2.5 - row), 0.35, ORANGE, 0.21)
+        return sheet.picture()
+
 
 class ConnectFour(LineGame):
     """Stones fall. Actions: a column. Row 0 is the lowest. A column is a byte, so that there are at most 7 rows and a spare bit."""
@@ -182,6 +201,16 @@ class ConnectFour(LineGame):
     def pack(self, squares: Int8[Array, "H W"]) -> Bits:
         weights = jnp.uint8(1) << jnp.arange(self.rows, dtype=jnp.uint8)
         return (squares.astype(jnp.uint8) * weights[:, None]).sum(0, dtype=jnp.uint8)
+
+    def draw(self, own: Int8[np.ndarray, "H W"], other: Int8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "X Y 3"]:
+        """Full discs are `own`, those with a hole the other's."""
+        sheet = Canvas((0, 0), (self.columns, self.rows), STONE)
+        for row, column in np.ndindex(self.rows, self.columns):
+            middle = (column + 0.5, row + 0.5)
+            sheet.disc(middle, 0.42, BLUE if own[row, column] else ORANGE if other[row, column] else PAPER)
+            if other[row, column]:
+                sheet.disc(middle, 0.18, PAPER)
+        return sheet.picture()
 
 
 def open_windows(game: ConnectFour, state: Board) -> Float[Array, ""]:

@@ -9,22 +9,25 @@ for the state that a step led to and the action u. It is near 0 where the pole h
 end, and nothing terminates: `make` cuts after 100 steps.
 """
 
+from collections.abc import Sequence
+
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
 from .acrobot import runge_kutta
-from .cartpole import FORCE, HALF_LENGTH, accelerations
+from .canvas import GREEN, Canvas
+from .cartpole import FORCE, HALF_LENGTH, accelerations, draw_cart
 
 TIME_STEP = 0.05
 EFFORT = 0.01
 """What a squared action costs."""
 
 
-class CartPoleSwingUp(Observed):
+class CartPoleSwingUp(Observed, Drawn):
     """A cart and a pole. Action: the force in units of 10 N, in [-1, 1].
 
     - State: position (m), velocity (m/s), angle (rad, 0 upright, not wrapped), angular velocity (rad/s).
@@ -56,6 +59,16 @@ class CartPoleSwingUp(Observed):
         observation, never = observe(state), jnp.zeros((), bool)
         reward = standing(state) - EFFORT * push**2
         return state, Timestep(observation, reward, never, never, observation, {})
+
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The ring is where the tip should be. The picture goes along with a cart that leaves it."""
+        del earlier
+        x, _, angle, _ = (float(v) for v in state)
+        aside = x - np.clip(x, -1.4, 1.4)
+        sheet = Canvas((aside - 2.6, -1.3), (aside + 2.6, 1.4))
+        sheet.disc((0, 2 * HALF_LENGTH), 0.14, GREEN, 0.09)
+        draw_cart(sheet, x, angle)
+        return sheet.picture()
 
 
 def observe(state: Float[Array, "4"]) -> Float[Array, "5"]:

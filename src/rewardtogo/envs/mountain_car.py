@@ -5,13 +5,16 @@ operations are those of Gymnasium's MountainCar-v0 (three pushes, -1 a step) and
 at the goal, less what the force costs).
 """
 
+from collections.abc import Sequence
+
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
+from .canvas import BLUE, GREEN, INK, MIST, STONE, Canvas
 
 MIN_POSITION = -1.2
 MAX_POSITION = 0.6
@@ -25,7 +28,7 @@ GOAL_REWARD = 100.0
 FORCE_COST = 0.1
 
 
-class MountainCar(Observed):
+class MountainCar(Observed, Drawn):
     """State and observation: position and velocity. Actions: 0 push left, 1 nothing, 2 push right."""
 
     @property
@@ -50,8 +53,13 @@ class MountainCar(Observed):
         reward = -jnp.ones((), state.dtype)
         return state, Timestep(state, reward, terminated, jnp.zeros((), bool), state, {})
 
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The flag is the goal."""
+        del earlier
+        return draw_hills(float(state[0]), GOAL)
 
-class MountainCarContinuous(Observed):
+
+class MountainCarContinuous(Observed, Drawn):
     """State and observation: position and velocity. Action: a force in [-1, 1].
 
     A force outside is clipped and yet costs what was asked for, as in Gymnasium.
@@ -80,6 +88,11 @@ class MountainCarContinuous(Observed):
         reward = GOAL_REWARD * terminated.astype(state.dtype) - FORCE_COST * force**2
         return state, Timestep(state, reward, terminated, jnp.zeros((), bool), state, {})
 
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The flag is the goal."""
+        del earlier
+        return draw_hills(float(state[0]), CONTINUOUS_GOAL)
+
 
 def drive(state: Float[Array, "2"], push: Float[Array, ""]) -> Float[Array, "2"]:
     """One step of the car under a push."""
@@ -98,3 +111,25 @@ def _box() -> spaces.Box:
 def _start(key: PRNGKey) -> Float[Array, "2"]:
     position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
     return jnp.stack([position, jnp.zeros_like(position)])
+
+
+def draw_hills(position: float, goal: float) -> UInt8[np.ndarray, "H W 3"]:
+    """The car on its hills, as high as Gymnasium draws them, and a flag at the goal."""
+    height = lambda x: 0.45 * np.sin(3 * x) + 0.55  # noqa: E731
+    sheet, along = Canvas((MIN_POSITION, 0.0), (MAX_POSITION, 1.25)), np.linspace(MIN_POSITION, MAX_POSITION, 100)
+    ground = [(x, height(x)) for x in along]
+    sheet.polygon([(MIN_POSITION, 0), *ground, (MAX_POSITION, 0)], MIST)
+    sheet.line(ground, 0.01, STONE)
+    foot, top = (goal, height(goal)), (goal, height(goal) + 0.16)
+    sheet.line([foot, top], 0.01, INK)
+    sheet.polygon([top, (goal - 0.09, top[1] - 0.035), (goal, top[1] - 0.07)], GREEN)
+    slope = np.arctan(1.35 * np.cos(3 * position))
+    ahead, up = np.array([np.cos(slope), np.sin(slope)]), np.array([-np.sin(slope), np.cos(slope)])
+    base = np.array([position, height(position)])
+    body = [
+        base + a * ahead + b * up for a, b in ((-0.06, 0.02), (0.06, 0.02), (0.06, 0.05), (0.02, 0.08), (-0.06, 0.08))
+    ]
+    sheet.polygon(body, BLUE)
+    for a in (-0.035, 0.035):
+        sheet.disc(base + a * ahead + 0.02 * up, 0.02, INK)
+    return sheet.picture()

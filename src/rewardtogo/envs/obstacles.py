@@ -6,13 +6,16 @@ somewhere in a square of 0.5, and the straight way is walled up. The reward of a
 never terminates: `make` cuts after 100 steps.
 """
 
+from collections.abc import Sequence
+
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
+from .canvas import BLUE, GREEN, PAPER, SKY, STONE, Canvas
 
 WALLS = ((-0.5, 0.1, 0.1, 0.2), (0.2, -0.7, 0.3, -0.1), (-0.4, -0.6, -0.3, -0.2))
 """Closed rectangles: left, lower, right, upper."""
@@ -22,7 +25,7 @@ STRIDE = 0.1
 """The longest move along each axis."""
 
 
-class Obstacles(Observed):
+class Obstacles(Observed, Drawn):
     """A point among walls. Action: its move in tenths, `[2]` in [-1, 1].
 
     State and observation: position (right, up), then the goal's.
@@ -55,6 +58,18 @@ class Obstacles(Observed):
         reward = -jnp.sqrt(jnp.sum((position - goal) ** 2) + 1e-12)
         never = jnp.zeros((), bool)
         return state, Timestep(state, reward, never, never, state, {})
+
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """Walls, the way so far, and the goal as a ring."""
+        sheet = Canvas((-1.05, -1.05), (1.05, 1.05), STONE)
+        sheet.box((-1, -1), (1, 1), PAPER)
+        for left, lower, right, upper in WALLS:
+            sheet.box((left, lower), (right, upper), STONE)
+        way = np.asarray([*earlier, state], float)
+        sheet.disc(way[-1, 2:], 0.07, GREEN, 0.045)
+        sheet.line(way[:, :2], 0.02, SKY)
+        sheet.disc(way[-1, :2], 0.045, BLUE)
+        return sheet.picture()
 
 
 def walled(start: Float[Array, "2"], end: Float[Array, "2"]) -> Bool[Array, ""]:

@@ -9,7 +9,7 @@
 
 import functools
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,10 +17,10 @@ import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from ..core import Action, Game, Observation, Observed, PRNGKey, State, Timestep
-from .board_games import TIC_TAC_TOE_LINES, Board
+from ..core import Action, Drawn, Game, Observation, Observed, PRNGKey, State, Timestep
+from .board_games import TIC_TAC_TOE_LINES, Board, LineGame
 
 
 class Opponent(eqx.Module):
@@ -142,7 +142,7 @@ class VersusState(eqx.Module):
     side: Int[Array, ""]
 
 
-class Versus(Observed):
+class Versus(Observed, Drawn):
     """`game` against `opponent`, who begins in half of the episodes. Reward: the game's, from the agent's side.
 
     A move that is not allowed loses at once.
@@ -180,6 +180,16 @@ class Versus(Observed):
         terminated = ~allowed | self.game.terminal(following)
         timestep = Timestep(observation, reward, terminated, jnp.zeros((), bool), observation, {})
         return VersusState(following, state.side), timestep
+
+    def render(self, state: VersusState, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The board, the agent's stones blue; None for a game without one."""
+        del earlier
+        if not isinstance(self.game, LineGame):
+            return None
+        board = jax.tree.map(jnp.asarray, state.game)
+        moves = int(self.game.player(board)) == int(state.side)
+        own, other = (board.mine, board.theirs) if moves else (board.theirs, board.mine)
+        return self.game.draw(np.asarray(self.game.unpack(own)), np.asarray(self.game.unpack(other)))
 
     def state_of(self, observation: Observation) -> VersusState:
         state = self.game.encode(observation)

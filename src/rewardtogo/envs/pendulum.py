@@ -4,13 +4,16 @@
 Pendulum-v1. Reward -(θ² + 0.1 θ'² + 0.001 u²), of the state that the action was chosen in. Never ends.
 """
 
+from collections.abc import Sequence
+
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
+from .canvas import BLUE, GREEN, INK, Canvas
 
 GRAVITY = 10.0
 MASS = 1.0
@@ -20,7 +23,7 @@ MAX_SPIN = 8.0
 MAX_TORQUE = 2.0
 
 
-class Pendulum(Observed):
+class Pendulum(Observed, Drawn):
     """One rod. Action: a torque in [-2, 2].
 
     - State: angle (rad, not wrapped), angular velocity (rad/s).
@@ -51,6 +54,15 @@ class Pendulum(Observed):
         state = dynamics(state, torque)
         observation, never = observe(state), jnp.zeros((), bool)
         return state, Timestep(observation, reward, never, never, observation, {})
+
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The ring is where the tip should be."""
+        del earlier
+        angle, sheet = float(state[0]), Canvas((-1.3, -1.3), (1.3, 1.3))
+        sheet.disc((0, LENGTH), 0.16, GREEN, 0.12)
+        sheet.line([(0, 0), (-LENGTH * np.sin(angle), LENGTH * np.cos(angle))], 0.16, BLUE)
+        sheet.disc((0, 0), 0.05, INK)
+        return sheet.picture()
 
 
 def observe(state: Float[Array, "2"]) -> Float[Array, "3"]:

@@ -13,14 +13,17 @@ cuts after 50 steps.
 Different from Gymnasium's Reacher-v5, which is the same task with MuJoCo's arm, armature and units.
 """
 
+from collections.abc import Sequence
+
 import gymnasium.spaces as spaces
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from ..core import Action, Observation, Observed, PRNGKey, State, Timestep
-from .acrobot import runge_kutta
+from ..core import Action, Drawn, Observation, Observed, PRNGKey, State, Timestep
+from .acrobot import draw_links, runge_kutta
+from .canvas import GREEN, MIST, ORANGE, Canvas
 
 LENGTH, MASS = 0.5, 1.0
 """Of either link, m and kg."""
@@ -37,7 +40,7 @@ NEAREST, FARTHEST = 0.2, 0.9
 """Distances of targets from the shoulder."""
 
 
-class Reacher(Observed):
+class Reacher(Observed, Drawn):
     """Two links. Action: torques `[2]` in units of the largest ones, in [-1, 1].
 
     - State: the two angles (rad, not wrapped), the two angular velocities (rad/s), the target (m).
@@ -81,6 +84,17 @@ class Reacher(Observed):
         distance = jnp.sqrt(jnp.sum(observation[8:] ** 2) + 1e-12)
         reward = -distance - EFFORT * jnp.sum(action**2)
         return state, Timestep(observation, reward, never, never, observation, {})
+
+    def render(self, state: State, earlier: Sequence[State] = ()) -> UInt8[np.ndarray, "H W 3"]:
+        """The ring is the target; the tip leaves a trail."""
+        far = 2 * LENGTH
+        sheet = Canvas((-1.1, -1.1), (1.1, 1.1))
+        sheet.disc((0, 0), far, MIST, far - 0.01)
+        links = lambda s: LENGTH * np.array([(np.cos(q), np.sin(q)) for q in np.cumsum(np.asarray(s, float)[:2])])  # noqa: E731
+        sheet.disc(np.asarray(state, float)[4:], 0.08, GREEN, 0.055)
+        sheet.line([links(s).sum(0) for s in (*earlier, state)], 0.015, ORANGE)
+        draw_links(sheet, links(state), 0.07)
+        return sheet.picture()
 
 
 def tip(angles: Float[Array, "2"]) -> Float[Array, "2"]:

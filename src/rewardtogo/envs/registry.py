@@ -13,9 +13,10 @@ from .board_games import ConnectFour, TicTacToe
 from .cartpole import CartPole
 from .cartpole_swing_up import CartPoleSwingUp
 from .catch import Catch
+from .drawing import Pictured
 from .envpool import EnvPool
 from .gymnasium import GymnasiumEnv, Source
-from .imitation_problems import Braking, Drone, Lane, LastTwo
+from .imitation_problems import Braking, Drone, Lane, LastTwo, draw_tightrope
 from .mountain_car import MountainCar, MountainCarContinuous
 from .obstacles import Obstacles
 from .opponents import PerfectOpponent, RandomOpponent, Versus
@@ -50,7 +51,7 @@ COMPILED: dict[str, Callable[..., Environment]] = {
     "BrakeLight": Braking,
     "LastTwo": LastTwo,
     "Drone": Drone,
-    "Tightrope": lambda: TabularEnv(tightrope()),
+    "Tightrope": lambda: Pictured(TabularEnv(tightrope()), draw_tightrope),
     "PixelPendulum": lambda: TimeLimit(FrameStack(PixelPendulum(), 2), 200),
     "PixelPendulumOneFrame": lambda: TimeLimit(PixelPendulum(), 200),
     "PixelDoubleIntegrator": lambda: TimeLimit(FrameStack(PixelDoubleIntegrator(), 2), 15),

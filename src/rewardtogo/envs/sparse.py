@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..core import MASK, Environment, Observation, PRNGKey, Timestep
+from ..core import MASK, Observation, Observed, PRNGKey, Timestep
 from .tabular import MDP, Table, check_discount, check_distributions, cumulative, draw, initial_distribution
 
 
@@ -216,7 +216,7 @@ def sparse_of(mdp: MDP) -> SparseMDP:
     return SparseMDP(successors, probabilities, rewards, initial, mdp.discount, mdp.terminal)
 
 
-class SparseEnv(Environment):
+class SparseEnv(Observed):
     """The environment of a `SparseMDP`: observes the state, draws an outcome, gives its reward.
 
     With `masks` the observation is a dictionary of the state and of which actions are allowed in it, as Gymnasium's door makes one of
@@ -251,6 +251,9 @@ class SparseEnv(Environment):
     def reset(self, key: PRNGKey) -> tuple[Int[Array, ""], Observation]:
         state = draw(self.start_table, jax.random.uniform(key, (), jnp.float32))
         return state, self._observe(state)
+
+    def state_of(self, observation: Observation) -> Int[Array, ""]:
+        return jnp.asarray(observation if self.masks is None else observation["observation"], jnp.int32)
 
     def step(self, state: Int[Array, ""], action: Int[Array, ""], key: PRNGKey) -> tuple[Int[Array, ""], Timestep]:
         outcome = draw(self.outcome_table[state, action], jax.random.uniform(key, (), jnp.float32))

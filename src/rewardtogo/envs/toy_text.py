@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Int8
 
 from ..core import Environment
+from .drawing import Pictured
+from .grids import ICE, Taxi, Walk
 from .sparse import SparseEnv, SparseMDP
 from .time_limit import TimeLimit
 
@@ -88,8 +90,16 @@ def _masks(env: Any) -> Int8[np.ndarray, "S A"] | None:
     return np.stack([env.action_mask(s) for s in range(len(env.P))])
 
 
+def _drawing(env: Any) -> Taxi | Walk:
+    if type(env).__name__ == "TaxiEnv":
+        return Taxi(frozenset((r, c) for r in range(5) for c in range(4) if env.desc[r + 1, 2 * c + 2] == b"|"))
+    if type(env).__name__ == "FrozenLakeEnv":
+        return Walk(tuple(b"".join(row).decode() for row in env.desc.tolist()), ICE)
+    return Walk(("F" * 12, "F" * 12, "F" * 12, "S" + "C" * 10 + "G"))
+
+
 def toy_text(name: str, **kwargs: Any) -> Environment:
     """The compiled twin of a toy environment, with the time limit that it is registered with. Raises as `gymnasium_table` does."""
     env = gymnasium_table(name, **kwargs)
     limit = gymnasium.spec(name).max_episode_steps
-    return TimeLimit(SparseEnv(table_mdp(env), _masks(env)), limit or LIMIT)
+    return TimeLimit(Pictured(SparseEnv(table_mdp(env), _masks(env)), _drawing(env)), limit or LIMIT)

@@ -5,20 +5,17 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 
-from ..core import MASK, EnvSpec, Spec
-from ..envs.toy_text import TABULAR
-from ..runner.play import drawable
+from ..core import MASK, EnvSpec
+from ..envs.drawing import observed, picture_of
+from ..runner.episode import compiled_env
 from .film import png
 from .queue import one_of
 from .run import LabelledRun, Round
 
 KEPT = 512
 """Pictures that are kept once drawn."""
-SMALLEST = 320
-"""Points that a picture is wide at least: small ones are enlarged."""
 MOST_NUMBERS = 64
 
 _POLE = ("position", "velocity", "angle", "angular velocity")
@@ -51,45 +48,20 @@ ACTIONS: dict[str, tuple[str, ...]] = {
 }
 """What the choices of an action are called, or in a box its entries."""
 
-_STATES: dict[str, Callable[[np.ndarray], Any]] = {
-    "CartPole-v1": lambda o: o,
-    "CartPoleNoVel-v1": lambda o: np.array([o[0], 0.0, o[1], 0.0]),
-    "MountainCar-v0": lambda o: o,
-    "MountainCarContinuous-v0": lambda o: o,
-    "Pendulum-v1": lambda o: np.array([np.arctan2(o[1], o[0]), o[2]]),
-    "PendulumNoVel-v1": lambda o: np.array([np.arctan2(o[1], o[0]), 0.0]),
-    "Acrobot-v1": lambda o: np.array([np.arctan2(o[1], o[0]), np.arctan2(o[3], o[2]), o[4], o[5]]),
-}
-"""The state in which Gymnasium's original draws what was observed in its twin, velocities that do not show aside."""
-
 
 class Pictures:
-    """The pictures of a run's observations: drawn by the original, filmed while acting, or the observation itself; else none."""
+    """The pictures of a run's observations: filmed while acting, or drawn as `rtg play` draws what is compiled; else none."""
 
     def __init__(self, run: LabelledRun):
-        described = run.plan.config["env"]
-        self.name, self._spec = described["id"], run.algorithm.spec.observation
+        self._env = compiled_env(run.plan.config["env"], run.plan.env)
+        self._space = run.algorithm.spec.observation.to_space()
         self._kept: OrderedDict[tuple[int, int], bytes] = OrderedDict()
         self._lock = threading.Lock()
-        self._original = self._drawn_by(described) if described["backend"] == "jax" and described["by_name"] else None
-
-    def _drawn_by(self, described: dict[str, Any]) -> gymnasium.Env | None:
-        if self.name not in _STATES and self.name not in TABULAR:
-            return None
-        # The masked environments are drawn whole, so the original is asked for by its own name.
-        name = self.name.replace("NoVel", "")
-        try:
-            env = drawable({**described, "id": name})
-            env.reset(seed=0)
-            env.render()
-        except Exception:  # without pygame, say: then numbers have to do
-            return None
-        return env
 
     def close(self) -> None:
-        """Let go of what draws."""
-        if self._original is not None:
-            self._original.close()
+        """Let go of what was drawn."""
+        with self._lock:
+            self._kept.clear()
 
     def png(self, batch: Round, index: int) -> bytes | None:
         """The picture of an observation as a PNG file; None where there is none."""
@@ -109,40 +81,9 @@ class Pictures:
         filmed = batch.folder / "frames" / f"{index:06d}.png"
         if filmed.exists():
             return filmed.read_bytes()
-        observation = one_of(batch.queue.observations, index)
-        if self._original is not None:
-            env: Any = self._original.unwrapped
-            if self.name in _STATES:
-                env.state = _STATES[self.name](np.asarray(observation, np.float64))
-            else:
-                env.s, env.lastaction = int(observation), None
-            return png(np.asarray(self._original.render(), np.uint8))
-        boards = [(s, v) for s, v in _parts(self._spec, observation) if _is_board(s)]
-        return _board(*boards[0]) if boards else None
-
-
-def _parts(spec: Spec, value: Any) -> list[tuple[Spec, np.ndarray]]:
-    if spec.kind != "dict":
-        return [(spec, np.asarray(value))]
-    return [(part, np.asarray(value[name])) for name, part in spec.parts if name != MASK]
-
-
-def _is_board(spec: Spec) -> bool:
-    return spec.kind == "box" and len(spec.shape) in (2, 3) and min(spec.shape[:2]) > 1
-
-
-def _board(spec: Spec, value: np.ndarray) -> bytes:
-    """A matrix, or a stack of them, as a picture: three channels are colours, others a stack whose last one is the latest."""
-    low, high = spec.bounds()
-    low, high = (low, high) if spec.is_bounded else (np.minimum(value.min(), 0), np.maximum(value.max(), 1))
-    grey = (255 * (value - low.astype(np.float64)) / np.maximum(high - low.astype(np.float64), 1e-9)).astype(np.uint8)
-    if grey.ndim == 3 and grey.shape[2] == 2:  # the stones of one player and of the other
-        picture = np.stack([grey[..., 0], grey[..., 1] // 2, grey[..., 1]], -1)
-    elif grey.ndim == 3 and grey.shape[2] == 3:
-        picture = grey
-    else:
-        picture = np.repeat((grey[..., -1] if grey.ndim == 3 else grey)[..., None], 3, -1)
-    return png(np.ascontiguousarray(picture), max(1, SMALLEST // picture.shape[1]))
+        seen = one_of(batch.queue.observations, index)
+        drawn = observed(self._space, seen) if self._env is None else picture_of(self._env, seen)
+        return None if drawn is None else png(drawn)
 
 
 def numbers(spec: EnvSpec, name: str, observations: Any) -> Callable[[int], list[dict[str, Any]]]:

@@ -52,9 +52,9 @@ class Played:
         }
 
     def film(self, path: str | Path, seed: int = 0) -> tuple[Path, float, int]:
-        """Draw an episode in Gymnasium's own environment: file, return and length. Raises `ValueError` as `play` does."""
+        """Draw an episode: file, return and length. Raises `ValueError` as `play` does."""
         policy = LoadedPolicy({"greedy": self.policy, "explore": self.policy}, self.spec, {})
-        described = {"id": self.env, "by_name": True, "kwargs": {}}
+        described = {"id": self.env, "backend": "jax", "by_name": True, "kwargs": {}}
         return film_of(policy, described, Path(path), seed)
 
 

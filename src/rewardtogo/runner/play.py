@@ -1,7 +1,4 @@
-"""Watching a policy: one episode in Gymnasium's own environment, which can draw, as a GIF or an MP4.
-
-The compiled twins have no pictures; they are the same environments, so their policies are shown in the originals.
-"""
+"""Watching a policy: one episode as a film, in the compiled environment it was trained in, or in Gymnasium's own, which draws itself."""
 
 import importlib
 import os
@@ -12,19 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import jax
 import numpy as np
 from PIL import Image
 
-from ..catalogue import ENVIRONMENTS
-from ..core import MASK, Learner
+from ..core import MASK, Environment, Learner, env_spec
 from ..envs import atari
+from .episode import compiled_env, drawn, endless, played
 from .evaluate import MAX_STEPS
 from .folder import RunFolder
 from .policy import LoadedPolicy, load
 
 ENDINGS = (".gif", ".mp4")
-MASKED = {"CartPoleNoVel-v1": ("CartPole-v1", (0, 2)), "PendulumNoVel-v1": ("Pendulum-v1", (0, 1))}
-"""Environments of ours that hide entries of one of Gymnasium's: which one, and the entries that are seen."""
+SECONDS = 6.0
+"""How long a film of a compiled environment lasts, whose steps have no time of their own, within `SLOWEST` and `FASTEST`."""
+SLOWEST = 2
+"""Frames a second."""
 MOST_FRAMES = 3000
 """Frames after which a film ends; the episode goes on without being drawn."""
 FASTEST = 50
@@ -38,13 +38,14 @@ def play(
     checkpoint: str = "last",
     stochastic: bool = False,
     *,
-    env: gymnasium.Env | Callable[..., gymnasium.Env] | None = None,
+    env: Any = None,
     learner: Learner | None = None,
 ) -> tuple[Path, float, int]:
     """Draw one episode into a film; returns its file, the episode's return and its length.
 
     - `out`: a `.gif` or `.mp4` (extra `video`); by default `episode.gif` in the run's folder.
-    - `env`: for a run made with an environment object: one with `render_mode="rgb_array"`, or what makes it with that argument.
+    - `env`: for a run made with an environment object: a compiled one, one of Gymnasium's with `render_mode="rgb_array"`, or a function
+      that makes either (the latter with that argument).
     - `learner`: needed for a run of a learner that is not part of the library.
 
     Raises `ValueError`, one sentence, where there is no picture to draw or a package is missing.
@@ -69,17 +70,38 @@ def film_of(
     path: Path,
     seed: int = 0,
     stochastic: bool = False,
-    env: gymnasium.Env | Callable[..., gymnasium.Env] | None = None,
+    env: Any = None,
 ) -> tuple[Path, float, int]:
     """An episode of a policy as a film. `described`: the environment as `config.json` has it."""
     require_film(path)
-    drawn = drawable(described, env)
+    compiled = compiled_env(described, env)
+    if compiled is not None:
+        return _compiled_film(compiled, described["id"], policy, path, seed, stochastic)
+    original = drawable(described, env)
     try:
-        with _Film(path, float(drawn.metadata.get("render_fps") or 30)) as film:
-            total, length = _episode(drawn, policy, seed, stochastic, film)
+        with _Film(path, float(original.metadata.get("render_fps") or 30)) as film:
+            total, length = _episode(original, policy, seed, stochastic, film)
     finally:
-        if drawn is not env:
-            drawn.close()
+        if original is not env:
+            original.close()
+    return path, total, length
+
+
+def _compiled_film(
+    env: Environment, name: str, policy: LoadedPolicy, path: Path, seed: int, stochastic: bool
+) -> tuple[Path, float, int]:
+    if env_spec(env) != policy.spec:
+        raise ValueError(f"the policy was not trained in {name}: it observes or acts in other spaces")
+    states, observations, total = played(env, policy.policy(explore=stochastic), jax.random.key(seed), name, True)
+    length = len(states) - 1
+    rate = min(max(length / SECONDS, SLOWEST), FASTEST)
+    with _Film(path, rate) as film:
+        for i in range(length + 1):
+            film.add(lambda i=i: drawn(env, name, states, observations, i))
+        last = drawn(env, name, states, observations, length)
+        # The end can be looked at for a second.
+        for _ in range(round(rate)):
+            film.add(lambda: last)
     return path, total, length
 
 
@@ -101,27 +123,18 @@ def drawable(described: dict[str, Any], env: Any = None) -> gymnasium.Env:
             f"the run was made with an environment object ({name}), which a file cannot hold: "
             "give it from Python with play(run, env=...)"
         )
-    base, keep = MASKED.get(name, (name, None))
-    if env is None and base.startswith(atari.PREFIX):
-        return atari.Game(base, render_mode="rgb_array", **described["kwargs"])
-    if env is None and ":" not in base and base not in gymnasium.registry:
-        what = "is one of the compiled environments without a picture" if name in ENVIRONMENTS else "is no environment"
-        raise ValueError(f"{name} {what}: play shows runs in Gymnasium's environments")
-    make = env if env is not None else lambda **kwargs: gymnasium.make(base, disable_env_checker=True, **kwargs)
+    if env is None and name.startswith(atari.PREFIX):
+        return atari.Game(name, render_mode="rgb_array", **described["kwargs"])
+    if env is None and ":" not in name and name not in gymnasium.registry:
+        raise ValueError(f"{name} is no environment: play shows runs in Gymnasium's environments and in compiled ones")
+    make = env if env is not None else lambda **kwargs: gymnasium.make(name, disable_env_checker=True, **kwargs)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a mode that the environment does not have, which is said below
             made = make(render_mode="rgb_array", **described["kwargs"])
     except (gymnasium.error.Error, ImportError, TypeError) as error:
         raise _no_picture(name, error) from error
-    return made if keep is None else _masked(made, keep)
-
-
-def _masked(env: gymnasium.Env, keep: tuple[int, ...]) -> gymnasium.Env:
-    space: Any = env.observation_space
-    entries = list(keep)
-    seen = gymnasium.spaces.Box(space.low[entries], space.high[entries], dtype=np.float32)
-    return gymnasium.wrappers.TransformObservation(env, lambda observation: observation[entries], seen)
+    return made
 
 
 def _no_picture(name: str, error: BaseException | None) -> ValueError:
@@ -153,7 +166,7 @@ def _episode(env: gymnasium.Env, policy: LoadedPolicy, seed: int, stochastic: bo
     film.add(lambda: _frame(env, name))
     while not over:
         if length >= MAX_STEPS:
-            raise ValueError(f"the episode of {name} did not end within {MAX_STEPS} steps: give it a time limit")
+            raise endless(name)
         action = policy(_with_mask(observation, info, policy), deterministic=not stochastic)
         observation, reward, terminated, truncated, info = env.step(action)
         total, length, over = total + float(reward), length + 1, bool(terminated or truncated)
