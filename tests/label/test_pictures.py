@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from rewardtogo.label import start_labelling
-from rewardtogo.label.pictures import ACTIONS, Pictures, numbers
+from rewardtogo.label.actions import ACTIONS
+from rewardtogo.label.pictures import Numbers, Pictures
 
 pytest.importorskip("pygame", reason="pictures need the extra render")
 
@@ -62,7 +63,9 @@ def test_numbers(tmp_path):
     with pictures_of("CartPole-v1", tmp_path) as run:
         assert run.round is not None
         seen = np.array([[1.0, 20.0, 0.1, -3.0], [0.0, -20.0, 0.0, 5.0]], np.float32)
-        shown = numbers(run.algorithm.spec, "CartPole-v1", seen)(0)
+        numbers = Numbers(run.algorithm.spec, "CartPole-v1")
+        numbers.see(seen)
+        shown = numbers.of(seen[0])
         assert [n["name"] for n in shown] == ["position", "velocity", "angle", "angular velocity"]
         assert [n["value"] for n in shown] == pytest.approx([1.0, 20.0, 0.1, -3.0])
         # A velocity has no bounds, so that the batch gives them.

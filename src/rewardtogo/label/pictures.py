@@ -1,5 +1,7 @@
-"""What a labeller looks at: an observation as a picture, as numbers with their names, and what the actions are called."""
+"""What a person looks at: an observation as a picture, and as numbers with their names."""
 
+import dataclasses
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -34,23 +36,6 @@ NUMBERS: dict[str, tuple[str, ...]] = {
     "Acrobot-v1": _JOINTS,
 }
 """What the numbers of an observation are called."""
-ACTIONS: dict[str, tuple[str, ...]] = {
-    "CartPole-v1": ("left", "right"),
-    "CartPoleNoVel-v1": ("left", "right"),
-    "MountainCar-v0": ("left", "none", "right"),
-    "MountainCarContinuous-v0": ("force",),
-    "Pendulum-v1": ("torque",),
-    "PendulumNoVel-v1": ("torque",),
-    "Acrobot-v1": ("negative torque", "none", "positive torque"),
-    "Catch": ("left", "stay", "right"),
-    "FrozenLake-v1": ("left", "down", "right", "up"),
-    "FrozenLake8x8-v1": ("left", "down", "right", "up"),
-    "CliffWalking-v1": ("up", "right", "down", "left"),
-    "Taxi-v4": ("down", "up", "right", "left", "pick up", "drop off"),
-    "LunarLander-v3": ("none", "left engine", "main engine", "right engine"),
-}
-"""What the choices of an action are called, or in a box its entries."""
-
 _STATES: dict[str, Callable[[np.ndarray], Any]] = {
     "CartPole-v1": lambda o: o,
     "CartPoleNoVel-v1": lambda o: np.array([o[0], 0.0, o[1], 0.0]),
@@ -63,14 +48,14 @@ _STATES: dict[str, Callable[[np.ndarray], Any]] = {
 """The state in which Gymnasium's original draws what was observed in its twin, velocities that do not show aside."""
 
 
-class Pictures:
-    """The pictures of a run's observations: drawn by the original, filmed while acting, or the observation itself; else none."""
+class Painter:
+    """Draws observations: as Gymnasium's original does where the environment is a twin, or the observation itself where it is a board.
 
-    def __init__(self, run: LabelledRun):
-        described = run.plan.config["env"]
-        self.name, self._spec = described["id"], run.algorithm.spec.observation
-        self._kept: OrderedDict[tuple[int, int], bytes] = OrderedDict()
-        self._lock = threading.Lock()
+    - `described`: the environment as `config.json` has it; `spec`: of its observations.
+    """
+
+    def __init__(self, described: dict[str, Any], spec: Spec):
+        self.name, self._spec = described["id"], spec
         self._original = self._drawn_by(described) if described["backend"] == "jax" and described["by_name"] else None
 
     def _drawn_by(self, described: dict[str, Any]) -> gymnasium.Env | None:
@@ -91,6 +76,31 @@ class Pictures:
         if self._original is not None:
             self._original.close()
 
+    def png(self, observation: Any) -> bytes | None:
+        """An observation as a PNG file; None where it has no picture."""
+        if self._original is not None:
+            env: Any = self._original.unwrapped
+            if self.name in _STATES:
+                env.state = _STATES[self.name](np.asarray(observation, np.float64))
+            else:
+                env.s, env.lastaction = int(_parts(self._spec, observation)[0][1]), None
+            return png(np.asarray(self._original.render(), np.uint8))
+        boards = [(s, v) for s, v in _parts(self._spec, observation) if _is_board(s)]
+        return _board(*boards[0]) if boards else None
+
+
+class Pictures:
+    """The pictures of a run's observations, by number: filmed while acting, or painted; the last ones are kept."""
+
+    def __init__(self, run: LabelledRun):
+        self._painter = Painter(run.plan.config["env"], run.algorithm.spec.observation)
+        self._kept: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        """Let go of what draws."""
+        self._painter.close()
+
     def png(self, batch: Round, index: int) -> bytes | None:
         """The picture of an observation as a PNG file; None where there is none."""
         place = (batch.number, batch.queue.index(index))
@@ -98,27 +108,14 @@ class Pictures:
             if place in self._kept:
                 self._kept.move_to_end(place)
                 return self._kept[place]
-            found = self._draw(batch, index)
+            filmed = batch.folder / "frames" / f"{index:06d}.png"
+            observation = one_of(batch.queue.observations, index)
+            found = filmed.read_bytes() if filmed.exists() else self._painter.png(observation)
             if found is not None:
                 self._kept[place] = found
                 while len(self._kept) > KEPT:
                     self._kept.popitem(last=False)
             return found
-
-    def _draw(self, batch: Round, index: int) -> bytes | None:
-        filmed = batch.folder / "frames" / f"{index:06d}.png"
-        if filmed.exists():
-            return filmed.read_bytes()
-        observation = one_of(batch.queue.observations, index)
-        if self._original is not None:
-            env: Any = self._original.unwrapped
-            if self.name in _STATES:
-                env.state = _STATES[self.name](np.asarray(observation, np.float64))
-            else:
-                env.s, env.lastaction = int(observation), None
-            return png(np.asarray(self._original.render(), np.uint8))
-        boards = [(s, v) for s, v in _parts(self._spec, observation) if _is_board(s)]
-        return _board(*boards[0]) if boards else None
 
 
 def _parts(spec: Spec, value: Any) -> list[tuple[Spec, np.ndarray]]:
@@ -145,30 +142,60 @@ def _board(spec: Spec, value: np.ndarray) -> bytes:
     return png(np.ascontiguousarray(picture), max(1, SMALLEST // picture.shape[1]))
 
 
-def numbers(spec: EnvSpec, name: str, observations: Any) -> Callable[[int], list[dict[str, Any]]]:
-    """What shows an observation in numbers: for each its name, value and the range in which it is drawn.
+@dataclasses.dataclass
+class _Column:
+    """One number of an observation: what it is called, where it stands, and the ends between which it is drawn."""
 
-    The range is that of the space; where that has no bounds, that of the batch.
+    title: str
+    part: str | None
+    index: int
+    low: float
+    high: float
+    grows: bool
+    """Whether the space has no ends for it, so that what was seen gives them."""
+
+
+class Numbers:
+    """Shows observations in numbers: for each its name, its value and the range in which it is drawn.
+
+    The range is that of the space; where that has no bounds, of what was seen (`see`). Boards, which
+    are seen as pictures, and parts of more than `MOST_NUMBERS` are left out.
     """
-    columns: list[tuple[str, np.ndarray, float, float]] = []
-    whole = spec.observation
-    for part, place in [(whole, None)] if whole.kind != "dict" else [(p, n) for n, p in whole.parts if n != MASK]:
-        values = np.asarray(observations if place is None else observations[place])
-        flat = values.reshape(len(values), -1).astype(np.float64)
-        if flat.shape[1] > MOST_NUMBERS:
-            continue
-        low, high = (b.ravel().astype(np.float64) for b in part.bounds()) if part.kind == "box" else (
-            np.zeros(flat.shape[1]),
-            np.asarray(part.counts or (2,) * flat.shape[1], np.float64) - 1,
-        )  # fmt: skip
-        known = NUMBERS.get(name, ()) if place is None else ()
-        for i in range(flat.shape[1]):
-            title = known[i] if i < len(known) else f"{place or 'value'}{f' {i}' if flat.shape[1] > 1 else ''}"
-            # Some spaces say 1e38 where they mean that there is no end.
-            ends = [low[i], high[i]] if max(abs(low[i]), abs(high[i])) < 1e6 else [flat[:, i].min(), flat[:, i].max()]
-            columns.append((title, flat[:, i], float(ends[0]), float(max(ends[1], ends[0] + 1e-9))))
 
-    def of(index: int) -> list[dict[str, Any]]:
-        return [{"name": t, "value": float(v[index]), "low": low, "high": high} for t, v, low, high in columns]
+    def __init__(self, spec: EnvSpec, name: str):
+        self.columns: list[_Column] = []
+        whole = spec.observation
+        for part, place in [(whole, None)] if whole.kind != "dict" else [(p, n) for n, p in whole.parts if n != MASK]:
+            if part.size > MOST_NUMBERS or _is_board(part):
+                continue
+            low, high = (b.ravel().astype(np.float64) for b in part.bounds()) if part.kind == "box" else (
+                np.zeros(part.size),
+                np.asarray(part.counts or (2,) * part.size, np.float64) - 1,
+            )  # fmt: skip
+            known = NUMBERS.get(name, ()) if place is None else ()
+            for i in range(part.size):
+                title = known[i] if i < len(known) else f"{place or 'value'}{f' {i}' if part.size > 1 else ''}"
+                # Some spaces say 1e38 where they mean that there is no end.
+                grows = bool(max(abs(low[i]), abs(high[i])) >= 1e6)
+                ends = (math.inf, -math.inf) if grows else (float(low[i]), float(high[i]))
+                self.columns.append(_Column(title, place, i, *ends, grows))
 
-    return of
+    def see(self, observations: Any) -> None:
+        """Take N observations, a tree of `[N, ...]`, into the ranges."""
+        for column in self.columns:
+            if column.grows:
+                values = np.asarray(observations if column.part is None else observations[column.part])
+                values = values.reshape(len(values), -1)[:, column.index]
+                column.low, column.high = min(column.low, float(values.min())), max(column.high, float(values.max()))
+
+    def of(self, observation: Any) -> list[dict[str, Any]]:
+        """One observation in numbers."""
+        return [
+            {
+                "name": c.title,
+                "value": float(np.ravel(observation if c.part is None else observation[c.part])[c.index]),
+                "low": c.low,
+                "high": max(c.high, c.low + 1e-9),
+            }
+            for c in self.columns
+        ]
