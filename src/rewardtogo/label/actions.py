@@ -8,6 +8,7 @@ import numpy as np
 from ..core import MASK, Spec
 from ..envs.atari import PREFIX
 
+_CELLS = tuple(f"{row} {column}" for row in ("top", "mid", "low") for column in ("left", "centre", "right"))
 ACTIONS: dict[str, tuple[str, ...]] = {
     "CartPole-v1": ("left", "right"),
     "CartPoleNoVel-v1": ("left", "right"),
@@ -21,6 +22,20 @@ ACTIONS: dict[str, tuple[str, ...]] = {
     "FrozenLake8x8-v1": ("left", "down", "right", "up"),
     "CliffWalking-v1": ("up", "right", "down", "left"),
     "Taxi-v4": ("down", "up", "right", "left", "pick up", "drop off"),
+    "Steering": ("left", "straight", "right"),
+    "Lane": ("steering",),
+    "BrakeLight": ("drive", "brake"),
+    "LastTwo": ("0", "1"),
+    "Drone": ("heading",),
+    "Tightrope": ("step", "climb"),
+    "PixelPendulum": ("torque",),
+    "PixelPendulumOneFrame": ("torque",),
+    "CartPoleSwingUp": ("force",),
+    "Reacher": ("torque 1", "torque 2"),
+    "TicTacToe": _CELLS,
+    "TicTacToePerfect": _CELLS,
+    "ConnectFour": tuple(f"column {i}" for i in range(1, 8)),
+    "ConnectFour5x5": tuple(f"column {i}" for i in range(1, 6)),
     "LunarLander-v3": ("none", "left engine", "main engine", "right engine"),
 }
 """What the choices of an action are called, or in a box its entries."""

@@ -49,13 +49,10 @@ class Filmed(gymnasium.Wrapper):
         return drawn(self.env)
 
 
-def png(picture: np.ndarray, scale: int = 1) -> bytes:
-    """An 8-bit picture as a PNG file, each point `scale` points wide."""
-    image = Image.fromarray(picture)
-    if scale > 1:
-        image = image.resize((image.width * scale, image.height * scale), Image.Resampling.NEAREST)
+def png(picture: np.ndarray) -> bytes:
+    """An 8-bit picture as a PNG file."""
     target = io.BytesIO()
-    image.save(target, "PNG", compress_level=1)
+    Image.fromarray(picture).save(target, "PNG", compress_level=1)
     return target.getvalue()
 
 

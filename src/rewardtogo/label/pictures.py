@@ -34,6 +34,12 @@ NUMBERS: dict[str, tuple[str, ...]] = {
     "Pendulum-v1": _PENDULUM,
     "PendulumNoVel-v1": ("cosine", "sine"),
     "Acrobot-v1": _JOINTS,
+    "BrakeLight": ("sensor", "light", "obstacle"),
+    "Lane": ("offset", "heading", "curvature"),
+    "Drone": ("tree",),
+    "LastTwo": ("bit",),
+    "CartPoleSwingUp": ("position", "velocity", "cosine", "sine", "angular velocity"),
+    "Obstacles": ("right", "up", "goal right", "goal up"),
 }
 """What the numbers of an observation are called."""
 _STATES: dict[str, Callable[[np.ndarray], Any]] = {
@@ -139,7 +145,11 @@ def _board(spec: Spec, value: np.ndarray) -> bytes:
         picture = grey
     else:
         picture = np.repeat((grey[..., -1] if grey.ndim == 3 else grey)[..., None], 3, -1)
-    return png(np.ascontiguousarray(picture), max(1, SMALLEST // picture.shape[1]))
+    scale = max(1, SMALLEST // picture.shape[1])
+    large = picture.repeat(scale, 0).repeat(scale, 1)
+    if grey.ndim == 3 and grey.shape[2] == 2 and scale > 8:  # the squares of the board
+        large[::scale] = large[:, ::scale] = 90
+    return png(np.ascontiguousarray(large))
 
 
 @dataclasses.dataclass
@@ -153,6 +163,8 @@ class _Column:
     high: float
     grows: bool
     """Whether the space has no ends for it, so that what was seen gives them."""
+    whole: bool
+    """Whether it is a whole number."""
 
 
 class Numbers:
@@ -178,7 +190,7 @@ class Numbers:
                 # Some spaces say 1e38 where they mean that there is no end.
                 grows = bool(max(abs(low[i]), abs(high[i])) >= 1e6)
                 ends = (math.inf, -math.inf) if grows else (float(low[i]), float(high[i]))
-                self.columns.append(_Column(title, place, i, *ends, grows))
+                self.columns.append(_Column(title, place, i, *ends, grows, np.dtype(part.dtype).kind != "f"))
 
     def see(self, observations: Any) -> None:
         """Take N observations, a tree of `[N, ...]`, into the ranges."""
@@ -196,6 +208,7 @@ class Numbers:
                 "value": float(np.ravel(observation if c.part is None else observation[c.part])[c.index]),
                 "low": c.low,
                 "high": max(c.high, c.low + 1e-9),
+                "whole": c.whole,
             }
             for c in self.columns
         ]

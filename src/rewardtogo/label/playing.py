@@ -60,6 +60,9 @@ class Playing:
             found.envs = [Held(one) for one in found.envs]
         self._held: Held | None = None if found is None else found.envs[0]
         try:
+            if not hosted(env):  # compiled before the first step is played, and not in it
+                state, _ = _reset(env, self._seed_key)
+                _step(env, state, self.spec.action.zeros(), self._seed_key, np.int32(0))
             self._begin()
         except BaseException:
             self.close()

@@ -34,7 +34,7 @@ SEAT = 5.0
 MOST_RATE = 100.0
 RECENT = 8
 """Episodes that the page lists."""
-NEUTRAL = ("none", "stay", "noop", "no-op", "nothing", "idle", "wait")
+NEUTRAL = ("none", "stay", "noop", "no-op", "nothing", "idle", "wait", "straight")
 """Names of actions that leave things as they are."""
 
 

@@ -104,7 +104,7 @@ def plan(
         if kind == "offline":
             if data is None:
                 raise ValueError(
-                    f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
+                    f"{name} learns from a dataset: make one with `rtg collect RUN` or `rtg demonstrate ENV`, and give it with --data"
                 )
             dataset = _dataset(data)
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **env_kwargs)  # type: ignore[arg-type]

@@ -196,8 +196,10 @@ function texts() {
       : "Enter begins the next one. X throws this one away.";
   } else if (!timed) {
     title = "What do you do?";
+    note = view.step ? "X throws the episode away, K ends it here and keeps it." : "Nothing happens until you choose.";
   } else if (running) {
     title = "Playing…";
+    note = "X throws the episode away, K ends it here and keeps it.";
   } else {
     title = view.step ? "Paused." : "Ready.";
     note = `Space or an action ${view.step ? "goes on" : "starts it"}.`;

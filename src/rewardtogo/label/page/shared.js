@@ -140,7 +140,8 @@ export class Controls {
 
 // --- what is seen -----------------------------------------------------------------------------------------------
 
-const inWords = (numbers) => numbers.map((n) => `${n.name} ${n.value.toFixed(3)}`).join(", ");
+const digits = (n) => (n.whole ? String(n.value) : n.value.toFixed(3));
+const inWords = (numbers) => numbers.map((n) => `${n.name} ${digits(n)}`).join(", ");
 
 // An observation in words, for those who do not see its picture.
 export const described = (title, numbers) => title + (numbers.length ? `: ${inWords(numbers)}` : "");
@@ -159,7 +160,7 @@ export function draw({ numbers, trail }) {
     const y = (value) => bottom - (Math.min(Math.max(value, n.low), n.high) - n.low) / (n.high - n.low) * (bottom - top);
     const x = (i) => 16 + i * (width - 40) / 8;
     pen.fillStyle = color("--quiet");
-    pen.fillText(`${n.name}   ${n.value.toFixed(3)}`, 16, row * height + 15);
+    pen.fillText(`${n.name}   ${digits(n)}`, 16, row * height + 15);
     pen.strokeStyle = color("--line");
     pen.lineWidth = 1;
     pen.strokeRect(10, top - 3, width - 20, bottom - top + 6);
@@ -193,6 +194,6 @@ export function table({ numbers, trail, picture }) {
     trail.forEach((t, i) => part("rect", { x: x(t[row]) - 1.5, y: 4, width: 3, height: 8, fill: "var(--trail)", opacity: (i + 1) / (trail.length + 1) }));
     part("rect", { x: x(n.value) - 2, y: 1, width: 4, height: 14, fill: "var(--accent)" });
     cell.append(svg);
-    const value = line.insertCell(); value.className = "value"; value.textContent = n.value.toFixed(3);
+    const value = line.insertCell(); value.className = "value"; value.textContent = digits(n);
   });
 }
