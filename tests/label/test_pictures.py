@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rewardtogo.core import Spec
 from rewardtogo.label import start_labelling
 from rewardtogo.label.actions import ACTIONS
-from rewardtogo.label.pictures import Numbers, Pictures
+from rewardtogo.label.pictures import Numbers, Painter, Pictures
 
 pytest.importorskip("pygame", reason="pictures need the extra render")
 
@@ -57,6 +58,19 @@ def test_boards_and_what_has_no_picture(tmp_path):
         assert scale >= 32 and np.array_equal(picture[scale // 2 :: scale, scale // 2 :: scale, 0], board)
     with pictures_of("OneStep", tmp_path / "b") as run:
         assert run.round is not None and Pictures(run).png(run.round, 0) is None
+
+
+def test_the_stones_of_both_players(tmp_path):
+    spec = Spec("box", (2, 6, 7), "int8", (0.0,), (1.0,))
+    painter = Painter({"id": "ConnectFour", "backend": "jax", "by_name": True, "kwargs": {}}, spec)
+    board = np.zeros((2, 6, 7), np.int8)
+    board[0, 0, 1] = board[1, 1, 6] = 1  # row 0 is the lowest
+    picture = np.asarray(Image.open(io.BytesIO(painter.png(board) or b"")), int)
+    scale = picture.shape[1] // 7
+    middle = picture[scale // 2 :: scale, scale // 2 :: scale]
+    blue, red = (middle[..., i] > 180 for i in (2, 0))
+    assert middle.shape == (6, 7, 3)
+    assert np.argwhere(blue & ~red).tolist() == [[5, 1]] and np.argwhere(red & ~blue).tolist() == [[4, 6]]
 
 
 def test_numbers(tmp_path):

@@ -92,6 +92,8 @@ class Painter:
                 env.s, env.lastaction = int(_parts(self._spec, observation)[0][1]), None
             return png(np.asarray(self._original.render(), np.uint8))
         boards = [(s, v) for s, v in _parts(self._spec, observation) if _is_board(s)]
+        if boards and self.name.startswith("ConnectFour"):  # whose lowest row is the first
+            return _board(boards[0][0], boards[0][1][:, ::-1])
         return _board(*boards[0]) if boards else None
 
 
@@ -135,21 +137,33 @@ def _is_board(spec: Spec) -> bool:
 
 
 def _board(spec: Spec, value: np.ndarray) -> bytes:
-    """A matrix, or a stack of them, as a picture: three channels are colours, others a stack whose last one is the latest."""
+    """A matrix, or a stack of them, as a picture.
+
+    Two are the stones of two players, three channels are colours, and of others the last one is the latest.
+    """
+    if value.ndim == 3 and 2 in (value.shape[0], value.shape[2]):
+        return _stones(value if value.shape[0] == 2 else np.moveaxis(value, 2, 0))
     low, high = spec.bounds()
     low, high = (low, high) if spec.is_bounded else (np.minimum(value.min(), 0), np.maximum(value.max(), 1))
     grey = (255 * (value - low.astype(np.float64)) / np.maximum(high - low.astype(np.float64), 1e-9)).astype(np.uint8)
-    if grey.ndim == 3 and grey.shape[2] == 2:  # the stones of one player and of the other
-        picture = np.stack([grey[..., 0], grey[..., 1] // 2, grey[..., 1]], -1)
-    elif grey.ndim == 3 and grey.shape[2] == 3:
+    if grey.ndim == 3 and grey.shape[2] == 3:
         picture = grey
     else:
         picture = np.repeat((grey[..., -1] if grey.ndim == 3 else grey)[..., None], 3, -1)
     scale = max(1, SMALLEST // picture.shape[1])
-    large = picture.repeat(scale, 0).repeat(scale, 1)
-    if grey.ndim == 3 and grey.shape[2] == 2 and scale > 8:  # the squares of the board
-        large[::scale] = large[:, ::scale] = 90
-    return png(np.ascontiguousarray(large))
+    return png(np.ascontiguousarray(picture.repeat(scale, 0).repeat(scale, 1)))
+
+
+def _stones(planes: np.ndarray) -> bytes:
+    """A board from above: `planes` `[2, rows, columns]`, where the own stones lie (blue) and where the other's (red)."""
+    scale = max(9, SMALLEST // planes.shape[2])
+    across = (np.arange(scale) - (scale - 1) / 2) / (scale / 2)
+    disc = np.tile(across[:, None] ** 2 + across**2 < 0.64, planes.shape[1:])
+    picture = np.full((*disc.shape, 3), 238, np.uint8)
+    picture[::scale] = picture[:, ::scale] = picture[-1] = picture[:, -1] = 160
+    for plane, colour in zip(planes, ((11, 98, 196), (214, 69, 48)), strict=True):
+        picture[disc & (plane > 0).repeat(scale, 0).repeat(scale, 1)] = colour
+    return png(picture)
 
 
 @dataclasses.dataclass
