@@ -22,7 +22,8 @@ pytest.importorskip("uvicorn", reason="the page needs the extra web")
 
 from rewardtogo.cli.main import main
 from rewardtogo.label import LabelledRun, start_labelling
-from rewardtogo.label.server import FILES, PAGE, listen, new_token, serve
+from rewardtogo.label.server import serve
+from rewardtogo.label.web import FILES, PAGE, listen, new_token
 
 TOKEN = "only-for-tests"
 LEARNER = {"network": {"sizes": [8]}, "learning_rate": 0.01}

@@ -12,7 +12,8 @@ from rewardtogo.core import MASK, from_space
 from rewardtogo.envs.drawing import picture
 from rewardtogo.envs.registry import COMPILED
 from rewardtogo.label import start_labelling
-from rewardtogo.label.pictures import ACTIONS, Pictures, numbers
+from rewardtogo.label.actions import ACTIONS
+from rewardtogo.label.pictures import Numbers, Pictures
 
 
 def pictures_of(env: str, tmp_path, size: int = 4):
@@ -79,7 +80,9 @@ def test_numbers(tmp_path):
     with pictures_of("CartPole-v1", tmp_path) as run:
         assert run.round is not None
         seen = np.array([[1.0, 20.0, 0.1, -3.0], [0.0, -20.0, 0.0, 5.0]], np.float32)
-        shown = numbers(run.algorithm.spec, "CartPole-v1", seen)(0)
+        numbers = Numbers(run.algorithm.spec, "CartPole-v1")
+        numbers.see(seen)
+        shown = numbers.of(seen[0])
         assert [n["name"] for n in shown] == ["position", "velocity", "angle", "angular velocity"]
         assert [n["value"] for n in shown] == pytest.approx([1.0, 20.0, 0.1, -3.0])
         # A velocity has no bounds, so that the batch gives them.

@@ -1,9 +1,7 @@
 """What each command does; imported only when one is run, because it loads JAX."""
 
 import argparse
-import contextlib
 import dataclasses
-import importlib.util
 import json
 import os
 import sys
@@ -12,7 +10,7 @@ from typing import Any
 
 import jax
 
-from ..catalogue import ENVIRONMENTS, LOOPS, algorithm_row, nearest
+from ..catalogue import LOOPS, algorithm_row, nearest
 from ..core import Schedule
 from ..envs.gymnasium import EnvironmentFailure
 from ..ops.schedules import to_text
@@ -20,7 +18,8 @@ from ..runner.config import PARTS, merge, options, part_of, resolve
 from ..runner.engine import NonFinite
 from ..runner.threads import threads_for, use_threads, used_threads
 from ..runner.train import Interrupted, Run, resume, train
-from .main import INTERRUPTED, SOLVERS, WRONG, RequestError, _say
+from . import people
+from .main import INTERRUPTED, SOLVERS, WRONG, RequestError, _say, value_of
 
 
 def cache_folder() -> Path:
@@ -67,7 +66,7 @@ def _train(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
     extra = {
         "learner": merge(file.get("learner", {}), groups["learner"]),
         "loop": merge(file.get("loop", {}), groups["loop"]),
-        "env_kwargs": {**file.get("env", {}), **{k: _value(v) for k, v in groups["env"].items()}},
+        "env_kwargs": {**file.get("env", {}), **{k: value_of(v) for k, v in groups["env"].items()}},
     }
     found = train(
         given.algorithm,
@@ -160,15 +159,6 @@ def _whole(name: str, value: Any) -> int | None:
     if value is None or (isinstance(value, int) and not isinstance(value, bool)):
         return value
     raise RequestError(f"the entry {name!r} of the configuration file must be a whole number, not {value!r}")
-
-
-def _value(text: Any) -> Any:
-    if not isinstance(text, str):
-        return text
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
 
 
 def _report(given: argparse.Namespace, found: Run | list[Run]) -> None:
@@ -322,7 +312,7 @@ def _solve(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None
         gamma=given.gamma,
         tolerance=given.tolerance,
         horizon=given.horizon,
-        **{k: _value(v) for k, v in groups["env"].items()},
+        **{k: value_of(v) for k, v in groups["env"].items()},
     )
     if given.json:
         print(json.dumps(found.to_json()))
@@ -358,54 +348,6 @@ def _plan(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
     if given.out:
         path, total, length = played.film(given.out, given.seed)
         print(f"{path}: return {total:.1f} in {length} steps", file=sys.stderr if given.json else sys.stdout)
-
-
-def _label(given: argparse.Namespace, groups: dict[str, dict[str, Any]]) -> None:
-    if importlib.util.find_spec("starlette") is None or importlib.util.find_spec("uvicorn") is None:
-        raise RequestError("the labelling page needs a small web server: pip install 'rewardtogo[web]'")
-    from ..label.run import ROUND_SIZE, ROUNDS, open_labelling, start_labelling
-    from ..label.server import listen, new_token, serve
-
-    if not 0 <= given.pause <= 3600:
-        raise RequestError(f"the pause must be 0 to 3600 seconds, not {given.pause:g}")
-    token = new_token(given.token)
-    names = tuple(name.strip() for name in given.actions.split(",")) if given.actions else ()
-    known = (Path(given.run) / "config.json").exists()
-    begins = {
-        **{f"--{name}": vars(given)[name.replace("-", "_")] for name in ("size", "votes", "num-envs", "seed", "out")},
-        **{f"--{name}": vars(given)[name] for name in ("backend", "data")},
-        **{f"--{name}.{next(iter(group), '')}": group or None for name, group in groups.items()},
-    }
-    set_already = [name for name, value in begins.items() if value is not None]
-    if known and set_already:
-        raise RequestError(f"{given.run} is a run whose {set_already[0]} is settled already: leave the option out")
-    if not known and (Path(given.run).is_dir() or os.sep in given.run) and given.run not in ENVIRONMENTS:
-        # Atari's names have a slash too.
-        if Path(given.run).is_dir() or not given.run.startswith("ALE/"):
-            raise RequestError(f"{given.run} is no run folder: it has no config.json")
-    with contextlib.closing(listen(given.host, given.port)) as listening:
-        if known:
-            run = open_labelling(given.run, rounds=given.rounds, quiet=given.quiet)
-        else:
-            run = start_labelling(
-                given.run,
-                out=given.out,
-                rounds=ROUNDS if given.rounds is None else given.rounds,
-                size=ROUND_SIZE if given.size is None else given.size,
-                votes=1 if given.votes is None else given.votes,
-                num_envs=1 if given.num_envs is None else given.num_envs,
-                seed=given.seed or 0,
-                backend=given.backend or "auto",
-                learner=groups["learner"],
-                loop=groups["loop"],
-                env_kwargs={k: _value(v) for k, v in groups["env"].items()},
-                data=given.data,
-                command=["rtg", *given.arguments],
-                quiet=given.quiet,
-            )
-        with run:
-            say = lambda text: print(text, file=sys.stderr, flush=True)  # noqa: E731
-            _report(given, serve(run, listening, token, pause=given.pause, actions=names, say=say))
 
 
 def show_options(algorithm: str) -> None:
@@ -461,9 +403,10 @@ COMMANDS = {
     "compare": _compare,
     "check-env": _check_env,
     "collect": _collect,
+    "demonstrate": people.demonstrate,
     "export": _export,
     "figure": _figure,
-    "label": _label,
+    "label": people.label,
     "plan": _plan,
     "solve": _solve,
 }

@@ -99,6 +99,19 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     def run_argument(parser: Parser) -> None:
         parser.add_argument("run", metavar="RUN", help="a run folder")
 
+    def page(parser: Parser, pause: str) -> None:
+        parser.add_argument("--actions", metavar="NAME,NAME,...", help="what the page calls the actions")
+        parser.add_argument(
+            "--host", default="127.0.0.1", metavar="ADDRESS", help="default 127.0.0.1: this machine alone"
+        )
+        parser.add_argument("--port", type=_whole, default=8765, metavar="P", help="default 8765; 0 takes any free one")
+        parser.add_argument(
+            "--token", metavar="TOKEN", help="what the address must have (default: a new one each time)"
+        )
+        parser.add_argument("--pause", type=_number, default=5.0, metavar="SECONDS", help=pause)
+        parser.add_argument("--quiet", action="store_true", help="print nothing but the address")
+        parser.add_argument("--json", action="store_true")
+
     def limits(parser: Parser) -> None:
         parser.add_argument("--steps", type=_steps, help="environment steps (gradient steps offline)")
         parser.add_argument(
@@ -269,20 +282,44 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     p.add_argument("--out", metavar="DIR", help="run folder (default runs/dagger-ENV-SEED-NUMBER)")
     p.add_argument("--backend", choices=BACKENDS, metavar="BACKEND", help="auto, jax, gymnasium or envpool")
     p.add_argument("--data", metavar="DATASET", help="demonstrations that the first policy learns from")
-    p.add_argument("--actions", metavar="NAME,NAME,...", help="what the page calls the actions")
-    p.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="default 127.0.0.1: this machine alone")
-    p.add_argument("--port", type=_whole, default=8765, metavar="P", help="default 8765; 0 takes any free one")
-    p.add_argument("--token", metavar="TOKEN", help="what the address must have (default: a new one each time)")
-    p.add_argument(
-        "--pause", type=_number, default=5.0, metavar="SECONDS", help="for a last Undo before it learns (default 5)"
+    page(p, "for a last Undo before it learns (default 5)")
+    p = command(
+        "demonstrate",
+        "play an environment on a page in the browser: the episodes that are kept become a dataset",
+        epilog="--env.NAME are the environment's arguments, as in `rtg train`",
     )
-    p.add_argument("--quiet", action="store_true", help="print nothing but the address")
-    p.add_argument("--json", action="store_true")
+    p.add_argument("env", metavar="ENV", help="a Gymnasium id (module:Id included) or one of `rtg list --envs`")
+    p.add_argument(
+        "--episodes",
+        type=_episodes,
+        metavar="N",
+        help="how many the dataset is to have, those included that it has already (default 10)",
+    )
+    p.add_argument("--out", metavar="DATASET", help="a new folder, or one to go on with (default datasets/ENV-NUMBER)")
+    p.add_argument("--seed", type=_seed, default=None, help="of the environment (default 0)")
+    p.add_argument(
+        "--rate",
+        type=_number,
+        metavar="STEPS_PER_SECOND",
+        help="0 waits for each action (default: what suits the environment)",
+    )
+    p.add_argument("--backend", choices=BACKENDS, metavar="BACKEND", help="auto, jax, gymnasium or envpool")
+    page(p, "in which the last episode can be thrown away still (default 5)")
     p = command("figure", "redraw a figure or experiment of the notes")
     p.add_argument("id", metavar="ID", nargs="?", help="such as 1.1; without it, the list")
     p.add_argument("--out", metavar="FILE", help="default figure-ID.png")
     p.add_argument("--seed", type=_seed, default=0)
     return main, table
+
+
+def value_of(text: Any) -> Any:
+    """What an option's text stands for: JSON where it is some, else itself."""
+    if not isinstance(text, str):
+        return text
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
 
 
 def _nested(pairs: Sequence[str], groups: tuple[str, ...], command: str = "train") -> dict[str, dict[str, Any]]:
@@ -376,9 +413,9 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
             return 0
         options, rest = table["train"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("learner", "loop", "env"))
-    elif arguments[0] == "solve" and not any(a in ("-h", "--help") for a in arguments):
-        options, rest = table["solve"].parse_known_args(arguments[1:])
-        groups = _nested(rest, ("env",), "solve")
+    elif arguments[0] in ("demonstrate", "solve") and not any(a in ("-h", "--help") for a in arguments):
+        options, rest = table[arguments[0]].parse_known_args(arguments[1:])
+        groups = _nested(rest, ("env",), arguments[0])
     elif arguments[0] == "label" and not any(a in ("-h", "--help") for a in arguments):
         options, rest = table["label"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("learner", "loop", "env"), "label")

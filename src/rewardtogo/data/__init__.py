@@ -5,6 +5,7 @@ from .episodes import concatenate as concatenate
 from .episodes import load_dataset as load_dataset
 from .episodes import save_dataset as save_dataset
 from .files import Damaged as Damaged
+from .growing import GrowingDataset as GrowingDataset
 from .minari import from_minari as from_minari
 from .minari import to_minari as to_minari
 from .n_step import n_step as n_step

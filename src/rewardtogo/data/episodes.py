@@ -152,22 +152,10 @@ def save_dataset(
     except OSError as error:
         raise ValueError(f"the dataset folder cannot be made: {error.strerror or error} ({error.filename})") from error
     try:
-        files = _write_files(temporary, dataset, file_bytes)
+        files = write_episodes(temporary, dataset, file_bytes)
         extras = {k: {"shape": list(v.shape[1:]), "dtype": str(v.dtype)} for k, v in dataset.transitions.extras.items()}
-        write_json(
-            temporary / "dataset.json",
-            {
-                "format": FORMAT,
-                "content": "dataset",
-                "episodes": dataset.num_episodes,
-                "steps": dataset.num_steps,
-                "observation": dataset.spec.observation.to_json(),
-                "action": dataset.spec.action.to_json(),
-                "extras": extras,
-                "files": files,
-                "about": about or {},
-            },
-        )
+        count, steps = dataset.num_episodes, dataset.num_steps
+        write_json(temporary / "dataset.json", describe_dataset(dataset.spec, count, steps, extras, files, about or {}))
         sync(temporary)
         if final.exists():
             final.rmdir()
@@ -243,13 +231,38 @@ def read_description(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def _write_files(folder: Path, dataset: Dataset, file_bytes: int) -> list[dict[str, Any]]:
+def describe_dataset(
+    spec: EnvSpec,
+    episodes: int,
+    steps: int,
+    extras: dict[str, Any],
+    files: list[dict[str, Any]],
+    about: dict[str, Any],
+) -> dict[str, Any]:
+    """What `dataset.json` says."""
+    return {
+        "format": FORMAT,
+        "content": "dataset",
+        "episodes": episodes,
+        "steps": steps,
+        "observation": spec.observation.to_json(),
+        "action": spec.action.to_json(),
+        "extras": extras,
+        "files": files,
+        "about": about,
+    }
+
+
+def write_episodes(
+    folder: Path, dataset: Dataset, file_bytes: int = FILE_BYTES, first: int = 0
+) -> list[dict[str, Any]]:
+    """Write a dataset's files, numbered from `first`; what `dataset.json` says of each."""
     t: Transition = jax.tree.map(np.asarray, dataset.transitions)
     bounds = dataset.bounds
     step_bytes = sum(leaf.nbytes for leaf in jax.tree.leaves(t)) / len(t.reward)
     group = ((bounds[1:] - 1) * step_bytes // file_bytes).astype(int)
     files = []
-    for number, g in enumerate(np.unique(group)):
+    for number, g in enumerate(np.unique(group), first):
         chosen = np.flatnonzero(group == g)
         start, stop = int(bounds[chosen[0]]), int(bounds[chosen[-1] + 1])
         done = (t.terminated | t.truncated)[start:stop]

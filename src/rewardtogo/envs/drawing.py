@@ -108,9 +108,14 @@ def observed(space: spaces.Space, observation: Any) -> Picture | None:
     spec = from_space(space)
     parts = [(spec, observation)] if spec.kind != "dict" else [(s, observation[n]) for n, s in spec.parts if n != MASK]
     for part, value in parts:
-        if part.kind == "box" and len(part.shape) in (2, 3) and min(part.shape[:2]) > 1:
+        if is_picture(part):
             return _grid(part, np.asarray(value))
     return None
+
+
+def is_picture(spec: Spec) -> bool:
+    """Whether what a space holds is looked at as a picture or a board, and not as numbers."""
+    return spec.kind == "box" and len(spec.shape) in (2, 3) and min(spec.shape[:2]) > 1
 
 
 def _grid(spec: Spec, value: np.ndarray) -> Picture:

@@ -1,14 +1,16 @@
-"""Pictures of what a policy comes to in environments outside the compiled program: drawn while it acts, since they cannot be set back."""
+"""Pictures of environments outside the compiled program: drawn while somebody acts in them, since they cannot be set back."""
 
 import contextlib
 import dataclasses
 import io
+import warnings
 from typing import Any
 
 import gymnasium
 import numpy as np
 from PIL import Image
 
+from ..core import VectorEnv
 from ..envs.atari import PREFIX
 from ..envs.gymnasium import hosted
 from ..envs.registry import make
@@ -44,43 +46,86 @@ class Filmed(gymnasium.Wrapper):
         return taken
 
     def _draw(self) -> bytes | None:
-        # An environment that cannot draw is shown in numbers.
-        with contextlib.suppress(Exception):
-            picture = self.env.render()
-            if isinstance(picture, np.ndarray) and picture.ndim == 3:
-                return png(picture)
-        return None
+        return drawn(self.env)
 
 
-def png(picture: np.ndarray, scale: int = 1) -> bytes:
-    """An 8-bit picture as a PNG file, each point `scale` points wide."""
-    image = Image.fromarray(picture)
-    if scale > 1:
-        image = image.resize((image.width * scale, image.height * scale), Image.Resampling.NEAREST)
+def png(picture: np.ndarray) -> bytes:
+    """An 8-bit picture as a PNG file."""
     target = io.BytesIO()
-    image.save(target, "PNG", compress_level=1)
+    Image.fromarray(picture).save(target, "PNG", compress_level=1)
     return target.getvalue()
+
+
+class Held(gymnasium.Wrapper):
+    """An environment that stays where its episode ended until it is seeded anew, so that the end can be looked at.
+
+    A vector environment asks for the next episode at once, without a seed: it gets the end once more.
+    """
+
+    def __init__(self, env: gymnasium.Env):
+        gymnasium.Wrapper.__init__(self, env)
+        self._last: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """As the environment does it, where there is a seed or nothing has begun."""
+        if seed is not None or self._last is None:
+            self._last = self.env.reset(seed=seed, options=options)
+        return self._last
+
+    def step(self, action: Any) -> Any:
+        """As the environment does it."""
+        found = self.env.step(action)
+        self._last = (found[0], found[4])
+        return found
+
+    def picture(self) -> bytes | None:
+        """What the environment draws now, as a PNG file; None where it draws nothing."""
+        return drawn(self.env)
+
+
+def drawn(env: gymnasium.Env) -> bytes | None:
+    """An environment's picture as a PNG file; one that cannot draw is shown in numbers: None."""
+    with contextlib.suppress(Exception):
+        picture: Any = env.render() if env.render_mode in ("rgb_array", "rgb_array_list") else None
+        picture = picture[-1] if isinstance(picture, list) and picture else picture
+        if isinstance(picture, np.ndarray) and picture.ndim == 3:
+            return png(picture.astype(np.uint8))
+    return None
+
+
+def singles(env: VectorEnv) -> Any:
+    """Where the single environments of one that Gymnasium steps lie, in its list `envs`; None for all others."""
+    found = [door.host.envs for door in hosted(env)]
+    return found[0] if found and isinstance(found[0], gymnasium.vector.SyncVectorEnv) else None
+
+
+def drawing(described: dict[str, Any], env: VectorEnv) -> VectorEnv:
+    """The same environment made anew so that it can draw, where it is one of Gymnasium's by name and has that mode; else as it was."""
+    if described["backend"] != "gymnasium" or not described["by_name"] or "render_mode" in described["kwargs"]:
+        return env
+    if described["id"].startswith(PREFIX) or singles(env) is None:
+        return env
+    without_a_screen()
+    arguments = {**described["kwargs"], "render_mode": "rgb_array"}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a mode that the environment does not have
+            found = make(described["id"], described["num_envs"], backend="gymnasium", **arguments)
+    except ValueError:
+        return env
+    for old in hosted(env):
+        old.close()
+    return found
 
 
 def film(part: Plan) -> Plan:
     """The plan with Gymnasium's environment drawing while it is acted in, where it is one by name that can; else as it was."""
-    described, env = part.config["env"], part.env
-    if (
-        not hosted(env)
-        or described["backend"] != "gymnasium"
-        or not described["by_name"]
-        or described["id"].startswith(PREFIX)
-    ):
+    if part.env is None:
         return part
-    without_a_screen()
-    arguments = {**described["kwargs"], "render_mode": "rgb_array"}
-    try:
-        drawn = make(described["id"], described["num_envs"], backend="gymnasium", **arguments)
-    except ValueError:
+    shown = drawing(part.config["env"], part.env)
+    if shown is part.env:
         return part
     algorithm: Any = part.algorithm
-    envs: Any = hosted(drawn)[0].host.envs
+    envs = singles(shown)
     envs.films = envs.envs = [Filmed(one) for one in envs.envs]
-    for old in hosted(env):
-        old.close()
-    return dataclasses.replace(part, env=drawn, algorithm=dataclasses.replace(algorithm, env=drawn))
+    return dataclasses.replace(part, env=shown, algorithm=dataclasses.replace(algorithm, env=shown))

@@ -1,14 +1,15 @@
-"""What a labeller looks at: an observation as a picture, as numbers with their names, and what the actions are called."""
+"""What a person looks at: an observation as a picture, and as numbers with their names."""
 
+import dataclasses
+import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..core import MASK, EnvSpec
-from ..envs.drawing import observed, picture_of
+from ..envs.drawing import is_picture, observed, picture_of
 from ..runner.episode import compiled_env
 from .film import png
 from .queue import one_of
@@ -29,24 +30,14 @@ NUMBERS: dict[str, tuple[str, ...]] = {
     "Pendulum-v1": _PENDULUM,
     "PendulumNoVel-v1": ("cosine", "sine"),
     "Acrobot-v1": _JOINTS,
+    "BrakeLight": ("sensor", "light", "obstacle"),
+    "Lane": ("offset", "heading", "curvature"),
+    "Drone": ("tree",),
+    "LastTwo": ("bit",),
+    "CartPoleSwingUp": ("position", "velocity", "cosine", "sine", "angular velocity"),
+    "Obstacles": ("right", "up", "goal right", "goal up"),
 }
 """What the numbers of an observation are called."""
-ACTIONS: dict[str, tuple[str, ...]] = {
-    "CartPole-v1": ("left", "right"),
-    "CartPoleNoVel-v1": ("left", "right"),
-    "MountainCar-v0": ("left", "none", "right"),
-    "MountainCarContinuous-v0": ("force",),
-    "Pendulum-v1": ("torque",),
-    "PendulumNoVel-v1": ("torque",),
-    "Acrobot-v1": ("negative torque", "none", "positive torque"),
-    "Catch": ("left", "stay", "right"),
-    "FrozenLake-v1": ("left", "down", "right", "up"),
-    "FrozenLake8x8-v1": ("left", "down", "right", "up"),
-    "CliffWalking-v1": ("up", "right", "down", "left"),
-    "Taxi-v4": ("down", "up", "right", "left", "pick up", "drop off"),
-    "LunarLander-v3": ("none", "left engine", "main engine", "right engine"),
-}
-"""What the choices of an action are called, or in a box its entries."""
 
 
 class Pictures:
@@ -86,30 +77,63 @@ class Pictures:
         return None if drawn is None else png(drawn)
 
 
-def numbers(spec: EnvSpec, name: str, observations: Any) -> Callable[[int], list[dict[str, Any]]]:
-    """What shows an observation in numbers: for each its name, value and the range in which it is drawn.
+@dataclasses.dataclass
+class _Column:
+    """One number of an observation: what it is called, where it stands, and the ends between which it is drawn."""
 
-    The range is that of the space; where that has no bounds, that of the batch.
+    title: str
+    part: str | None
+    index: int
+    low: float
+    high: float
+    grows: bool
+    """Whether the space has no ends for it, so that what was seen gives them."""
+    whole: bool
+    """Whether it is a whole number."""
+
+
+class Numbers:
+    """Shows observations in numbers: for each its name, its value and the range in which it is drawn.
+
+    The range is that of the space; where that has no bounds, of what was seen (`see`). Boards, which
+    are seen as pictures, and parts of more than `MOST_NUMBERS` are left out.
     """
-    columns: list[tuple[str, np.ndarray, float, float]] = []
-    whole = spec.observation
-    for part, place in [(whole, None)] if whole.kind != "dict" else [(p, n) for n, p in whole.parts if n != MASK]:
-        values = np.asarray(observations if place is None else observations[place])
-        flat = values.reshape(len(values), -1).astype(np.float64)
-        if flat.shape[1] > MOST_NUMBERS:
-            continue
-        low, high = (b.ravel().astype(np.float64) for b in part.bounds()) if part.kind == "box" else (
-            np.zeros(flat.shape[1]),
-            np.asarray(part.counts or (2,) * flat.shape[1], np.float64) - 1,
-        )  # fmt: skip
-        known = NUMBERS.get(name, ()) if place is None else ()
-        for i in range(flat.shape[1]):
-            title = known[i] if i < len(known) else f"{place or 'value'}{f' {i}' if flat.shape[1] > 1 else ''}"
-            # Some spaces say 1e38 where they mean that there is no end.
-            ends = [low[i], high[i]] if max(abs(low[i]), abs(high[i])) < 1e6 else [flat[:, i].min(), flat[:, i].max()]
-            columns.append((title, flat[:, i], float(ends[0]), float(max(ends[1], ends[0] + 1e-9))))
 
-    def of(index: int) -> list[dict[str, Any]]:
-        return [{"name": t, "value": float(v[index]), "low": low, "high": high} for t, v, low, high in columns]
+    def __init__(self, spec: EnvSpec, name: str):
+        self.columns: list[_Column] = []
+        whole = spec.observation
+        for part, place in [(whole, None)] if whole.kind != "dict" else [(p, n) for n, p in whole.parts if n != MASK]:
+            if part.size > MOST_NUMBERS or is_picture(part):
+                continue
+            low, high = (b.ravel().astype(np.float64) for b in part.bounds()) if part.kind == "box" else (
+                np.zeros(part.size),
+                np.asarray(part.counts or (2,) * part.size, np.float64) - 1,
+            )  # fmt: skip
+            known = NUMBERS.get(name, ()) if place is None else ()
+            for i in range(part.size):
+                title = known[i] if i < len(known) else f"{place or 'value'}{f' {i}' if part.size > 1 else ''}"
+                # Some spaces say 1e38 where they mean that there is no end.
+                grows = bool(max(abs(low[i]), abs(high[i])) >= 1e6)
+                ends = (math.inf, -math.inf) if grows else (float(low[i]), float(high[i]))
+                self.columns.append(_Column(title, place, i, *ends, grows, np.dtype(part.dtype).kind != "f"))
 
-    return of
+    def see(self, observations: Any) -> None:
+        """Take N observations, a tree of `[N, ...]`, into the ranges."""
+        for column in self.columns:
+            if column.grows:
+                values = np.asarray(observations if column.part is None else observations[column.part])
+                values = values.reshape(len(values), -1)[:, column.index]
+                column.low, column.high = min(column.low, float(values.min())), max(column.high, float(values.max()))
+
+    def of(self, observation: Any) -> list[dict[str, Any]]:
+        """One observation in numbers."""
+        return [
+            {
+                "name": c.title,
+                "value": float(np.ravel(observation if c.part is None else observation[c.part])[c.index]),
+                "low": c.low,
+                "high": max(c.high, c.low + 1e-9),
+                "whole": c.whole,
+            }
+            for c in self.columns
+        ]

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import PyTree
 
-from ..core import MASK, EnvSpec
+from ..core import EnvSpec
 from ..data.files import Damaged, sync
+from .actions import allowed, element
 
 LEASE = 120.0
 """Seconds for which an observation that somebody is looking at is given to nobody else."""
@@ -142,44 +143,11 @@ class LabelQueue:
 
     def action(self, index: int, value: Any) -> np.ndarray:
         """An action for an observation, as an array of the action space. Raises `ValueError` where it is not in it."""
-        spec = self.spec.action
-        try:
-            given = np.asarray(value, np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"an action here is {self._wanted()}, not {value!r}") from None
-        if given.shape != spec.shape or not np.all(np.isfinite(given)):
-            raise ValueError(f"an action here is {self._wanted()}, not {value!r}")
-        if spec.kind == "box":
-            low, high = spec.bounds()
-            # A slider's last step may lie a rounding error beyond the end.
-            slack = 1e-6 * np.maximum(1.0, np.abs(given))
-            inside = bool(np.all((given >= low - slack) & (given <= high + slack)))
-            found = np.clip(given.astype(spec.dtype), low, high)
-        else:
-            counts = np.asarray(spec.counts or (2,)).reshape(spec.shape if spec.counts else ())
-            inside = bool(np.all((given == np.round(given)) & (given >= 0) & (given < counts)))
-            found = given.astype(spec.dtype) if inside else given
-        if not inside:
-            raise ValueError(f"an action here is {self._wanted()}, not {value!r}")
-        allowed = self.allowed(index)
-        if allowed is not None and not allowed[int(found)]:
-            raise ValueError(
-                f"action {int(found)} is forbidden at observation {index}: allowed are {np.flatnonzero(allowed).tolist()}"
-            )
-        return found
+        return element(self.spec.action, value, self.allowed(index), f"at observation {index}")
 
     def allowed(self, index: int) -> np.ndarray | None:
         """Which actions are allowed at an observation, where it says so."""
-        observations: Any = self.observations
-        masked = isinstance(observations, dict) and MASK in observations and self.spec.action.kind == "discrete"
-        return np.asarray(observations[MASK][index]) > 0 if masked else None
-
-    def _wanted(self) -> str:
-        spec = self.spec.action
-        if spec.kind == "discrete":
-            return f"a whole number from 0 to {spec.counts[0] - 1}"
-        where = " within the bounds of its box" if spec.kind == "box" else ", each a choice that there is"
-        return f"{spec.size} numbers of shape {spec.shape}{where}"
+        return allowed(self.spec.action, one_of(self.observations, index))
 
     # --- questions and answers ------------------------------------------------------------------------------------------------------
 

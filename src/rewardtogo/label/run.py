@@ -9,11 +9,10 @@ function would gives the run that has that function as its expert (and beta = 0,
 
 import dataclasses
 import math
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,7 @@ import numpy as np
 
 from ..core import Actor, Episodes
 from ..data.files import FORMAT, Damaged, load_tree, read_json, save_tree, sync, write_json
+from ..data.lock import FolderLock
 from ..envs.gymnasium import hosted
 from ..imitation.dagger import DAgger, DAggerState, Queries
 from ..runner.engine import Moment, Program, steps_after
@@ -78,7 +78,10 @@ class LabelledRun:
                 f"{folder.path} is not a run that a person labels: begin one with `rtg label ENV`, such as `rtg label CartPole-v1`"
             )
         self.folder, self.votes = folder, int(part.config["votes"])
-        self._lock = _Lock(folder.path / "labels" / "lock", folder.path)
+        self._lock = FolderLock(
+            folder.path / "labels" / "lock",
+            f"another process is labelling {folder.path}: use its page, or stop it first (several labellers share one page)",
+        )
         self.plan = film(part)
         self.algorithm: Any = self.plan.algorithm
         self._program = Program(self.algorithm, jax.random.key(part.config["seed"]), 1)
@@ -389,36 +392,3 @@ def _in_a_row(x: np.ndarray) -> np.ndarray:
 def _by_step(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The inverse of `_in_a_row`."""
     return np.ascontiguousarray(np.swapaxes(x.reshape(shape[1], shape[0], *x.shape[1:]), 0, 1))
-
-
-class _Lock:
-    """Keeps a second process out of a folder; the system lets go of it when this one ends, however it ends."""
-
-    def __init__(self, path: Path, run: Path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file: IO[bytes] | None = path.open("a+b")
-        try:
-            _lock(self._file)
-        except OSError as error:
-            self._file.close()
-            raise ValueError(
-                f"another process is labelling {run}: use its page, or stop it first (several labellers share one page)"
-            ) from error
-
-    def release(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-
-if os.name == "nt":
-    import msvcrt
-
-    def _lock(file: IO[bytes]) -> None:
-        file.seek(0)
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-else:
-    import fcntl
-
-    def _lock(file: IO[bytes]) -> None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

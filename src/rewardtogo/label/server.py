@@ -1,46 +1,30 @@
-"""The page on which people label: a small server on this machine, its address guarded by a token (`rtg label`; the extra `web`).
+"""The page on which people label (`rtg label`).
 
 The page asks in JSON and gets the next observation with the answer to each request, so that a label costs one round trip. Every
 answer is on the disk before it is acknowledged. What learns is not the server's threads but the one that called `serve`.
 """
 
-import errno
-import os
-import secrets
 import socket
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import uvicorn
-from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ..runner.train import Interrupted, Run, StopSignal
-from .pictures import ACTIONS, Pictures, numbers
-from .queue import Answer, LabelQueue
+from .actions import described, names_of
+from .pictures import Numbers, Pictures
+from .queue import Answer, LabelQueue, one_of
 from .run import LabelledRun, Round
+from .web import HEADERS, PAUSE, Guard, answered, body_of, guarded, serving
 
-PAGE = Path(__file__).parent / "page"
-FILES = {"/label.css": "text/css", "/label.js": "text/javascript"}
-"""What is served to everybody: it says nothing of the run."""
 BEFORE = 8
 """Observations before the one to be labelled that the page shows in motion."""
-PAUSE = 5.0
-"""Seconds after the last answer of a batch in which it can still be taken back, before the next round begins."""
-LARGEST_BODY = 2**16
-HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
 
 
 class Desk:
@@ -50,43 +34,23 @@ class Desk:
         self.run, self.pause, self.pictures = run, pause, Pictures(run)
         self.status = "labelling"
         self.seen_done = threading.Event()
-        self._actions = actions or ACTIONS.get(run.plan.config["env"]["id"], ())
-        self._check_names()
+        self._names = names_of(run.plan.config["env"], run.algorithm.spec.action, actions)
         self._asked = False
         self._done_since: float | None = None
-        self._numbers: tuple[int, Callable[[int], list[dict[str, Any]]]] | None = None
+        self._numbers: tuple[int, Numbers] | None = None
         self._results: list[dict[str, float]] = []
-
-    def _check_names(self) -> None:
-        spec = self.run.algorithm.spec.action
-        wanted = spec.counts[0] if spec.kind == "discrete" else spec.size
-        if self._actions and len(self._actions) != wanted:
-            raise ValueError(
-                f"there are {wanted} {'actions' if spec.kind == 'discrete' else 'entries of an action'} here, and "
-                f"{len(self._actions)} names were given: {', '.join(self._actions)}"
-            )
 
     # --- what the page shows -------------------------------------------------------------------------------------------------------
 
     def setup(self) -> dict[str, Any]:
         """What does not change while the page is open."""
-        spec = self.run.algorithm.spec.action
-        low, high = spec.bounds() if spec.kind == "box" else (np.zeros(spec.shape), np.zeros(spec.shape))
-        number = lambda x: float(x) if np.isfinite(x) else None  # noqa: E731
         return {
             "env": self.run.plan.config["env"]["id"],
             "run": str(self.run.folder.path),
             "rounds": self.run.rounds,
             "votes": self.run.votes,
             "pause": self.pause,
-            "action": {
-                "kind": spec.kind,
-                "shape": list(spec.shape),
-                "counts": list(spec.counts or (2,) * spec.size),
-                "low": [number(x) for x in np.ravel(low)],
-                "high": [number(x) for x in np.ravel(high)],
-                "names": list(self._actions),
-            },
+            "action": described(self.run.algorithm.spec.action, self._names),
         }
 
     def view(self, who: Any, at: Any = None) -> dict[str, Any]:
@@ -111,9 +75,10 @@ class Desk:
         queue, allowed = batch.queue, batch.queue.allowed(index)
         answers = queue.answers(index)
         if self._numbers is None or self._numbers[0] != batch.number:
-            env = self.run.plan.config["env"]["id"]
-            self._numbers = (batch.number, numbers(self.run.algorithm.spec, env, queue.observations))
-        show, before = self._numbers[1], batch.before(index, BEFORE)
+            self._numbers = (batch.number, Numbers(self.run.algorithm.spec, self.run.plan.config["env"]["id"]))
+            self._numbers[1].see(queue.observations)
+        show = lambda i: self._numbers[1].of(one_of(queue.observations, i))  # type: ignore[index]  # noqa: E731
+        before = batch.before(index, BEFORE)
         mine = answers.get(who)
         return {
             "index": index,
@@ -200,49 +165,21 @@ def _plain(answer: Answer | None) -> Any:
 # --- the web --------------------------------------------------------------------------------------------------------------------------
 
 
-class Guard:
-    """Lets nobody in who does not know the token, in the address or in a header."""
-
-    def __init__(self, app: ASGIApp, token: str):
-        self.app, self.token = app, token
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse with status 403, or pass on."""
-        if scope["type"] != "http":
-            return
-        request = Request(scope, receive)
-        given = request.headers.get("x-token") or request.query_params.get("token") or ""
-        if request.url.path in FILES or secrets.compare_digest(given.encode(), self.token.encode()):
-            await self.app(scope, receive, send)
-            return
-        sentence = (
-            "the address has no token" if not given else "the token in the address is wrong"
-        ) + ": open the address that `rtg label` printed last"
-        await JSONResponse({"error": sentence}, 403, headers=HEADERS)(scope, receive, send)
-
-
 def application(desk: Desk, token: str) -> Guard:
     """The page and what it asks, for a server such as uvicorn."""
 
-    async def page(request: Request) -> Response:
-        return FileResponse(PAGE / "index.html", headers={**HEADERS, "Cache-Control": "no-store"})
-
-    async def file(request: Request) -> Response:
-        path = request.url.path
-        return FileResponse(PAGE / path[1:], media_type=FILES[path], headers={**HEADERS, "Cache-Control": "no-cache"})
-
     async def setup(request: Request) -> Response:
-        return await _answered(desk.setup)
+        return await answered(desk.setup)
 
     async def item(request: Request) -> Response:
         query = request.query_params
-        return await _answered(lambda: desk.view(query.get("by", ""), _whole(query["at"]) if "at" in query else None))
+        return await answered(lambda: desk.view(query.get("by", ""), _whole(query["at"]) if "at" in query else None))
 
     async def answer(request: Request) -> Response:
-        return await _answered(lambda body=await _body(request): desk.answer(body.get("by"), body))
+        return await answered(lambda body=await body_of(request): desk.answer(body.get("by"), body))
 
     async def finish(request: Request) -> Response:
-        return await _answered(lambda body=await _body(request): desk.finish(body.get("round")))
+        return await answered(lambda body=await body_of(request): desk.finish(body.get("round")))
 
     async def frame(request: Request) -> Response:
         try:
@@ -255,78 +192,17 @@ def application(desk: Desk, token: str) -> Guard:
         return Response(picture, media_type="image/png", headers={**HEADERS, "Cache-Control": "private, max-age=86400"})
 
     routes = [
-        Route("/", page),
-        *(Route(path, file) for path in FILES),
         Route("/api/setup", setup),
         Route("/api/item", item),
         Route("/api/answer", answer, methods=["POST"]),
         Route("/api/finish", finish, methods=["POST"]),
         Route("/frame/{round:int}/{index:int}.png", frame),
     ]
-    return Guard(Starlette(routes=routes), token)
+    return guarded("label.html", routes, token, "rtg label")
 
 
 def _whole(text: str) -> Any:
     return int(text) if text.lstrip("-").isdigit() and len(text) < 20 else text
-
-
-async def _body(request: Request) -> dict[str, Any]:
-    """The JSON object that was sent; an empty one for anything else, which is then refused for what it lacks."""
-    if int(request.headers.get("content-length", LARGEST_BODY + 1)) > LARGEST_BODY:
-        return {}
-    try:
-        data = await request.json()
-    except ValueError:
-        return {}
-    return data if isinstance(data, dict) else {}
-
-
-async def _answered(call: Callable[[], Any]) -> Response:
-    """What the desk says as JSON; a wrong request as status 400, one of another round as 409, each with one sentence."""
-    headers = {**HEADERS, "Cache-Control": "no-store"}
-    try:
-        found = await run_in_threadpool(call)
-    except LookupError as error:
-        return JSONResponse({"error": str(error.args[0])}, 409, headers=headers)
-    except ValueError as error:
-        return JSONResponse({"error": str(error)}, 400, headers=headers)
-    except OSError as error:
-        return JSONResponse({"error": str(error)}, 507, headers=headers)
-    return JSONResponse(found if found is not None else {}, headers=headers)
-
-
-def new_token(given: str | None = None) -> str:
-    """A token that nobody can guess, or the given one. Raises `ValueError` where that is short or would not fit in an address."""
-    if given is None:
-        return secrets.token_urlsafe(16)
-    if len(given) < 8 or not all(c.isascii() and (c.isalnum() or c in "-_.~") for c in given):
-        raise ValueError(f"a token is at least 8 letters, digits, or any of -_.~, not {given!r}")
-    return given
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A socket on which nobody else listens. Raises `ValueError` where the port is taken or there is no such address."""
-    if isinstance(port, bool) or not 0 <= port < 2**16:
-        raise ValueError(f"a port is a number from 0 (any free one) to 65535, not {port}")
-    try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        found = socket.socket(family, socket.SOCK_STREAM)
-    except OSError as error:
-        raise ValueError(f"there is no address {host} on this machine: leave --host out, or give 127.0.0.1") from error
-    try:
-        if os.name != "nt":  # there it would let two servers share a port
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.bind(address)
-        found.listen(128)
-    except OSError as error:
-        found.close()
-        if error.errno in (errno.EADDRINUSE, errno.EACCES):
-            why = "is taken by another server" if error.errno == errno.EADDRINUSE else "may not be used by you"
-            raise ValueError(
-                f"port {port} {why}: stop that one, or give another --port (0 takes any free one)"
-            ) from error
-        raise ValueError(f"{host}:{port} cannot be listened on: {error.strerror or error}") from error
-    return found
 
 
 def serve(
@@ -343,16 +219,11 @@ def serve(
     Raises `Interrupted` after Ctrl-C or SIGTERM: every answer is on the disk, and `open_labelling` goes on from there.
     """
     desk = Desk(run, pause, actions)
-    config = uvicorn.Config(
-        application(desk, token), log_level="error", access_log=False, lifespan="off", timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-    host, port = listening.getsockname()[:2]
     try:
-        with StopSignal() as asked:
-            thread.start()
-            say(f"label at http://{f'[{host}]' if ':' in host else host}:{port}/?token={token}")
+        with (
+            StopSignal() as asked,
+            serving(application(desk, token), listening, lambda address: say(f"label at {address}"), token) as thread,
+        ):
             while desk.status != "done" and not asked.raised and thread.is_alive():
                 if not desk.work():
                     time.sleep(0.02)
@@ -363,7 +234,4 @@ def serve(
             raise Interrupted(f"stopped; every answer is kept: go on with `rtg label {run.folder.path}`")
         return run.result()
     finally:
-        server.should_exit = True
-        thread.join(timeout=5.0)
-        listening.close()
         desk.pictures.close()

@@ -97,7 +97,7 @@ def collect_demonstrations(
         "return_mean": found["return_mean"],
         "versions": versions(),
     }
-    return save_dataset(_numbered(safe_name(name)) if out is None else out, dataset, about), found
+    return save_dataset(numbered_dataset(safe_name(name)) if out is None else out, dataset, about), found
 
 
 class Recorded(Policy):
@@ -187,7 +187,8 @@ def _environment(described: dict[str, Any], env: Any, backend: str, episodes: in
     return name, make(env, lanes_for(episodes, compiled), backend=backend, **kwargs)  # type: ignore[arg-type]
 
 
-def _numbered(name: str) -> Path:
+def numbered_dataset(name: str) -> Path:
+    """The first folder `datasets/NAME-NUMBER` that is not there yet."""
     number = 1
     while (Path("datasets") / f"{name}-{number}").exists():
         number += 1

@@ -106,7 +106,7 @@ def plan(
         if kind == "offline":
             if data is None:
                 raise ValueError(
-                    f"{name} learns from a dataset: make one with `rtg collect RUN`, and give it with --data"
+                    f"{name} learns from a dataset: make one with `rtg collect RUN` or `rtg demonstrate ENV`, and give it with --data"
                 )
             dataset = _dataset(data)
             vector_env = None if env is None else make(env, num_envs or 1, backend=backend, **env_kwargs)  # type: ignore[arg-type]
@@ -138,13 +138,7 @@ def plan(
     inner = _learner_of(whole) if inner is not None else None
     config = {
         "algorithm": name,
-        "env": {
-            "id": env_name,
-            "backend": _backend(vector_env),
-            "num_envs": vector_env.num_envs if vector_env is not None else 0,
-            "kwargs": env_kwargs,
-            "by_name": isinstance(env, str),
-        },
+        "env": described_env(env, vector_env, env_kwargs),
         "learner": describe(inner) if inner is not None else {},
         "loop": describe(whole),
         "data": str(data) if isinstance(data, (str, Path)) else None,
@@ -159,6 +153,17 @@ def plan(
         "versions": versions(),
     }
     return Plan(whole, inner, vector_env, _evaluation_env(env, vector_env, backend, env_kwargs, eval_episodes), config)
+
+
+def described_env(source: Any, env: VectorEnv | None, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """What `config.json` says of an environment that was made of `source` and arguments."""
+    return {
+        "id": source if isinstance(source, str) else _title(source),
+        "backend": _backend(env),
+        "num_envs": env.num_envs if env is not None else 0,
+        "kwargs": kwargs,
+        "by_name": isinstance(source, str),
+    }
 
 
 def from_config(
