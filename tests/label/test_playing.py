@@ -14,9 +14,12 @@ import rewardtogo as rtg
 from rewardtogo.core import Environment, Timestep, env_spec
 from rewardtogo.data import Damaged, load_dataset
 from rewardtogo.data.episodes import read_description
+from rewardtogo.envs.drawing import picture_of
 from rewardtogo.envs.host import seeds_of
+from rewardtogo.envs.registry import COMPILED
 from rewardtogo.imitation import BC
 from rewardtogo.label import Playing, play_by, start_playing
+from rewardtogo.label.film import png
 from rewardtogo.label.playing import playable_rate
 from rewardtogo.runner.plan import plan
 
@@ -106,6 +109,22 @@ def test_gymnasiums_own_gives_what_gymnasium_gives(tmp_path):
         from PIL import Image
 
         assert np.array_equal(np.asarray(Image.open(io.BytesIO(picture))), np.asarray(env.render()))
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "FrozenLake-v1", "TicTacToe"])
+def test_where_a_compiled_episode_ended_is_seen(env, tmp_path):
+    """And not where the next one begins, which the automatic reset of copies side by side would show."""
+    with begin(tmp_path / "data", env) as playing:
+        while playing.over is None:
+            playing.act(int(np.argmax(playing.allowed)) if playing.allowed is not None else 1)
+        wanted = picture_of(COMPILED[env](), playing.observation)
+        if env == "TicTacToe":  # at the end an observation does not tell whose turn it was
+            board = playing.observation["board"]
+            wanted = COMPILED[env]().game.draw(board[0], board[1])
+        assert wanted is not None and playing.picture() == png(np.asarray(wanted))
+        ended = playing.picture()
+        playing.begin()
+        assert playing.picture() != ended
 
 
 def test_thrown_away_and_cut(tmp_path):
