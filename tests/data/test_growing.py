@@ -1,6 +1,7 @@
 """A dataset that grows by whole episodes: what is added is what is read, files are whole whenever the process ends."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,14 +14,14 @@ ABOUT = {"env": "Made-up", "collector": {"player": "test"}}
 
 def episode(length: int, seed: int) -> Trajectory:
     draws = np.random.default_rng(seed)
-    arrays = (
-        draws.normal(size=(length + 1, 2)).astype(np.float32),
-        draws.integers(0, 3, length).astype(np.int32),
-        draws.normal(size=length).astype(np.float32),
-        np.asarray(seed % 2 == 0),
-        np.asarray(seed % 2 == 1),
+    return Trajectory(
+        jnp.asarray(draws.normal(size=(length + 1, 2)), jnp.float32),
+        jnp.asarray(draws.integers(0, 3, length), jnp.int32),
+        jnp.asarray(draws.normal(size=length), jnp.float32),
+        jnp.asarray(seed % 2 == 0),
+        jnp.asarray(seed % 2 == 1),
+        {},
     )
-    return Trajectory(*(jax.numpy.asarray(a) for a in arrays), {})
 
 
 def same(one: Dataset, other: Dataset) -> bool:
