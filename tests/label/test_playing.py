@@ -14,9 +14,12 @@ import rewardtogo as rtg
 from rewardtogo.core import Environment, Timestep, env_spec
 from rewardtogo.data import Damaged, load_dataset
 from rewardtogo.data.episodes import read_description
+from rewardtogo.envs.drawing import picture_of
 from rewardtogo.envs.host import seeds_of
+from rewardtogo.envs.registry import COMPILED
 from rewardtogo.imitation import BC
 from rewardtogo.label import Playing, play_by, start_playing
+from rewardtogo.label.film import png
 from rewardtogo.label.playing import playable_rate
 from rewardtogo.runner.plan import plan
 
@@ -106,6 +109,23 @@ def test_gymnasiums_own_gives_what_gymnasium_gives(tmp_path):
         from PIL import Image
 
         assert np.array_equal(np.asarray(Image.open(io.BytesIO(picture))), np.asarray(env.render()))
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "FrozenLake-v1", "TicTacToe"])
+def test_where_a_compiled_episode_ended_is_seen(env, tmp_path):
+    """And not where the next one begins, which the automatic reset of copies side by side would show."""
+    with begin(tmp_path / "data", env) as playing:
+        while playing.over is None:
+            playing.act(int(np.argmax(playing.allowed)) if playing.allowed is not None else 1)
+        inner: Any = COMPILED[env]()
+        wanted = [picture_of(inner, playing.observation)]
+        if env == "TicTacToe":  # at the end an observation does not tell whose stones are whose
+            one, other = playing.observation["board"]
+            wanted = [inner.game.draw(one, other), inner.game.draw(other, one)]
+        assert playing.picture() in [png(np.asarray(w)) for w in wanted]
+        ended = playing.picture()
+        playing.begin()
+        assert playing.picture() != ended
 
 
 def test_thrown_away_and_cut(tmp_path):

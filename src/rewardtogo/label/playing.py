@@ -89,7 +89,7 @@ class Playing:
         if self._held is not None and (drawn := self._held.picture()) is not None:
             return drawn
         if isinstance(self.env, Vectorized):
-            seen = picture(self.env.env, _only(self._state), self.observation)
+            seen = picture(self.env.env, _only(jax.device_get(self._state)), self.observation)
         else:
             seen = observed(self.spec.observation.to_space(), self.observation)
         return None if seen is None else png(seen)
@@ -209,11 +209,17 @@ def _reset(env: VectorEnv, key: PRNGKey) -> tuple[State, PyTree[Array]]:
 def _step(
     env: VectorEnv, state: State, action: Array, key: PRNGKey, step: Array
 ) -> tuple[State, tuple[PyTree[Array], Array, Array, Array]]:
-    state, t = env.step(state, action[None], jax.random.fold_in(key, step + 1)[None])
+    key = jax.random.fold_in(key, step + 1)
+    if isinstance(env, Vectorized):
+        # As in `Vectorized.step`, but without the automatic reset: where the episode ended is to be looked at.
+        inner = env.env
+        state, t = jax.vmap(lambda s, a, k: inner.step(s, a, k))(state, action[None], jax.random.split(key)[:1])
+    else:
+        state, t = env.step(state, action[None], key[None])
     return state, _only((t.final_observation, t.reward, t.terminated, t.truncated))
 
 
-def _only(tree: PyTree[Array]) -> PyTree[Array]:
+def _only(tree: PyTree) -> PyTree:
     """That of the one environment there is."""
     return jax.tree.map(lambda x: x[0], tree)
 
