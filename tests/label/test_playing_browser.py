@@ -132,7 +132,7 @@ def test_cartpole_by_keyboard_killed_finished_and_cloned(browser, start, tmp_pat
     first = load_dataset(out)
     assert first.num_episodes == 1 and first.num_steps >= 60 and bool(first.transitions.truncated[-1])
     picture = page.locator("#picture")
-    assert picture.is_visible() and page.evaluate("document.getElementById('picture').naturalWidth") == 600
+    assert picture.is_visible() and page.evaluate("document.getElementById('picture').naturalWidth") >= 320
 
     # A second tab waits, and can take over.
     other = browser.new_page()
