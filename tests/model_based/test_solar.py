@@ -16,7 +16,7 @@ from rewardtogo.core import EnvSpec, Rollout, Spec, Transition
 from rewardtogo.envs import FrameStack, PixelDoubleIntegrator
 from rewardtogo.envs.pixel_double_integrator import cost, dynamics, noise
 from rewardtogo.model_based import SOLAR
-from rewardtogo.model_based.learned import encode_action
+from rewardtogo.model_based.planned import encode_action
 from rewardtogo.model_based.solar import QuadraticCost, sequence_terms, unscaled
 from rewardtogo.model_based.structured import ExpectedDynamics, Laws, smoothed_states
 from rewardtogo.ops import kalman_filter

@@ -1,6 +1,7 @@
 """`rtg play`: an episode as a film, of the compiled environment itself, or of Gymnasium's."""
 
 import sys
+from typing import Any
 
 import gymnasium
 import jax
@@ -23,6 +24,7 @@ from rewardtogo.runner.policy import load
 
 
 def frames_of(path):
+    film: Any
     with Image.open(path) as film:
         frames = []
         for i in range(film.n_frames):
@@ -37,7 +39,8 @@ def stepped(env, policy, seed):
     state, observation = jax.jit(lambda k: env.reset(k))(reset_key)
     step = jax.jit(lambda s, a, k: env.step(s, a, k))
     choose = jax.jit(lambda c, o, k: policy(c, o, k))
-    states, pictures, rewards = [state], [picture(env, state, observation)], []
+    pictures: list[Any] = [picture(env, state, observation)]
+    states, rewards = [state], []
     carry, over = policy.init(carry_key), False
     while not over:
         act_key, step_key = jax.random.split(jax.random.fold_in(loop_key, len(rewards)))

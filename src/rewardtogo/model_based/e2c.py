@@ -32,7 +32,6 @@ from ..core import (
     Action,
     Batch,
     EnvSpec,
-    Learner,
     Model,
     Number,
     Observation,
@@ -45,10 +44,9 @@ from ..core import (
 )
 from ..nn import Optimiser, RunningNorm, flat_size, flatten_observation
 from ..ops.distributions import DiagGaussian
-from ..planning.mpc import ILQR, MPC, Planner
-from ..planning.problem import ModelProblem
-from .latent import Dense, PlanOrRandom
-from .learned import encode_action
+from ..planning.mpc import ILQR, Planner
+from .latent import Dense
+from .planned import ModelLearner, encode_action, gaussian, planning, scaled
 
 LEAST_STD = 1e-3
 """Of the encoder's Gaussian."""
@@ -90,8 +88,7 @@ class E2CNetworks(eqx.Module):
 
     def encode(self, x: Float[Array, "O"]) -> DiagGaussian:
         """q(z | x)."""
-        mean, spread = jnp.split(self.encoder(x), 2)
-        return DiagGaussian(mean, jnp.log(jax.nn.softplus(spread) + LEAST_STD))
+        return gaussian(self.encoder(x), LEAST_STD)
 
     def about(self, z: Float[Array, "L"]) -> LocallyLinear:
         """A, B and o at z."""
@@ -162,7 +159,7 @@ class E2CState(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-class E2C(Learner):
+class E2C(ModelLearner):
     """Learn a latent state with locally linear dynamics from transitions, and act by regulators towards the goal's latent. Boxes alone.
 
     An observation must tell the state, and the reward must be greatest at the goal.
@@ -216,11 +213,7 @@ class E2C(Learner):
 
     def policy(self, state: E2CState, explore: bool) -> Policy:
         now = self.at(state.updates)
-        problem = ModelProblem(self.model(state), self.horizon, state.spec.action, jnp.asarray(now.gamma, jnp.float32))
-        planning = MPC(problem, now.planner)
-        if not explore:
-            return planning
-        return PlanOrRandom(planning, state.updates == 0, jnp.asarray(now.noise, jnp.float32), state.spec.action)
+        return planning(now, self.model(state), state.spec.action, explore, state.updates == 0, now.noise)
 
     def update(self, state: E2CState, batch: Batch, key: PRNGKey) -> tuple[E2CState, dict[str, Array], Any]:
         now, t, spec = self.at(state.updates), batch.transitions, state.spec
@@ -237,13 +230,10 @@ class E2C(Learner):
         def loss(networks: E2CNetworks) -> tuple[Float[Array, ""], E2CTerms]:
             each = jax.vmap(lambda *now: e2c_terms(networks, *now))(before, actions, after, keys)
             terms = jax.tree.map(lambda x: (weights * x).sum(), each)
-            scale = 0.5 / jnp.asarray(now.observation_scale, jnp.float32) ** 2
-            total = scale * (terms.observation + terms.next_observation) + terms.prior_kl
+            total = scaled(terms.observation + terms.next_observation, now.observation_scale) + terms.prior_kl
             return total + jnp.asarray(now.consistency, jnp.float32) * terms.consistency_kl, terms
 
-        (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(state.networks)
-        rule = Optimiser(now.learning_rate, now.max_grad_norm)
-        networks, optimiser = rule.step(state.networks, gradient, state.optimiser)
+        networks, optimiser, value, terms = now.descended(loss, state.networks, state.optimiser)
         metrics = {
             "model_loss": value,
             "prior_kl": terms.prior_kl,

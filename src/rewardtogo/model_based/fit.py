@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, PyTree, ScalarLike
 from ..core import EnvSpec, Number, PRNGKey, Schedule, Solution, Spec, Transition
 from ..nn import Optimiser, RunningNorm, flatten_observation
 from .ensembles import Ensemble, Prediction, gaussian_nll
-from .learned import LearnedModel, Objective, encode_action
+from .learned import LearnedModel, Objective
+from .planned import encode_action
 from .posteriors import Bootstrap, Posterior
 
 

@@ -29,15 +29,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..core import (
     Action,
     Batch,
-    Carry,
     EnvSpec,
-    Learner,
-    Model,
     Number,
     Observation,
     Policy,
@@ -48,10 +45,9 @@ from ..core import (
     setting,
 )
 from ..nn import Linear, Optimiser, RunningNorm, flat_size, flatten_observation
-from ..planning.mpc import MPC, CrossEntropy, Planner
-from ..planning.problem import ModelProblem
+from ..planning.mpc import CrossEntropy, Planner
 from .fit import standards
-from .learned import encode_action, explored
+from .planned import Imagining, ModelLearner, encode_action, encoded_size, planning, scaled, standardised_rewards
 
 DECAY = 0.99
 """Of the running mean and variance of the latents."""
@@ -113,7 +109,7 @@ class Imagined(eqx.Module):
     alive: Float[Array, ""]
 
 
-class LatentModel(Model):
+class LatentModel(Imagining):
     """Encoder, dynamics and rewards as a `Model` to plan in. Transitions are the means."""
 
     networks: LatentNetworks
@@ -141,13 +137,6 @@ class LatentModel(Model):
         following, outcome = followed(self.networks, state.latent, encode_action(self.action, action))
         reward = self.rewards.mean[""][0] + self.rewards.sd()[0] * outcome[0]
         return Imagined(following, state.alive * reward, state.alive * jax.nn.sigmoid(-outcome[1]))
-
-    def reward(self, state: Imagined, action: Action, next_state: Imagined) -> Float[Array, ""]:
-        del state, action
-        return next_state.reward
-
-    def terminal(self, state: Imagined) -> Bool[Array, ""]:
-        return state.alive < 1e-3
 
 
 def followed(
@@ -222,27 +211,7 @@ class LatentState(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-class PlanOrRandom(Policy):
-    """Plans and adds noise, or acts at random while there is nothing to plan with."""
-
-    planning: MPC
-    random: Bool[Array, ""]
-    noise: Float[Array, ""]
-    action: Spec = eqx.field(static=True)
-
-    def init(self, key: PRNGKey) -> Carry:
-        return self.planning.init(key)
-
-    def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
-        plan_key, random_key, noise_key = jax.random.split(key, 3)
-        after, planned, _ = self.planning(carry, observation, plan_key)
-        return after, explored(self.action, planned, self.random, self.noise, random_key, noise_key), {}
-
-    def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
-        return self.planning.inspect(carry, observation)
-
-
-class LatentMBRL(Learner):
+class LatentMBRL(ModelLearner):
     """Learn a latent state, its dynamics and rewards from sequences of observations, and act by planning from g(o).
 
     Any actions but binary ones. An observation must tell the state: stack pictures.
@@ -273,7 +242,7 @@ class LatentMBRL(Learner):
         return ("discrete", "multi_discrete", "box")
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> LatentState:
-        seen, actions = flat_size(spec.observation), encode_action(spec.action, spec.action.zeros()).size
+        seen, actions = flat_size(spec.observation), encoded_size(spec.action)
         size, keys = self.latent_size, jax.random.split(key, 4)
         networks = LatentNetworks(
             Dense.of(seen, self.encoder_sizes, size, keys[0]),
@@ -299,11 +268,7 @@ class LatentMBRL(Learner):
 
     def policy(self, state: LatentState, explore: bool) -> Policy:
         now = self.at(state.updates)
-        problem = ModelProblem(self.model(state), self.horizon, state.spec.action, jnp.asarray(now.gamma, jnp.float32))
-        planning = MPC(problem, self.planner)
-        if not explore:
-            return planning
-        return PlanOrRandom(planning, state.updates == 0, jnp.asarray(now.noise, jnp.float32), state.spec.action)
+        return planning(now, self.model(state), state.spec.action, explore, state.updates == 0, now.noise)
 
     def update(self, state: LatentState, batch: Batch, key: PRNGKey) -> tuple[LatentState, dict[str, Array], Any]:
         del key
@@ -316,20 +281,17 @@ class LatentMBRL(Learner):
         seen = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), t.observation, last)
         vectors = jax.vmap(jax.vmap(model.vector))(seen)
         actions = jax.vmap(jax.vmap(lambda a: encode_action(spec.action, a)))(t.action)
-        wanted = (t.reward - rewards.mean[""][0]) / rewards.sd()[0]
+        wanted = standardised_rewards(rewards, t.reward)
         ended = t.terminated.astype(jnp.float32)
         # The last step's next observation is its own, whatever ended there; but an end has no state to be compared with.
         cut = (t.terminated | t.truncated).astype(jnp.float32).at[-1].set(ended[-1])
 
         def loss(networks: LatentNetworks) -> tuple[Float[Array, ""], tuple[Terms, Array]]:
             terms, raw = sequence_terms(networks, vectors, actions, wanted, ended, cut, batch.weights)
-            scaled = lambda error, scale: 0.5 * error / jnp.asarray(scale, jnp.float32) ** 2  # noqa: E731
             total = scaled(terms.latent, now.latent_scale) + scaled(terms.observation, now.observation_scale)
             return total + scaled(terms.reward, now.reward_scale) + terms.end, (terms, raw)
 
-        (value, (terms, raw)), gradient = jax.value_and_grad(loss, has_aux=True)(state.networks)
-        rule = Optimiser(now.learning_rate, now.max_grad_norm)
-        networks, optimiser = rule.step(state.networks, gradient, state.optimiser)
+        networks, optimiser, value, (terms, raw) = now.descended(loss, state.networks, state.optimiser)
         latents = state.latents.update(raw.reshape(-1, raw.shape[-1]))
         spread = standardised(raw, latents.mean, latents.variance).reshape(-1, raw.shape[-1]).std(0)
         metrics = {

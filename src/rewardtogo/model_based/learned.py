@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..core import Action, Model, Observation, PRNGKey, Spec
+from ..core import Action, Observation, PRNGKey, Spec
 from ..nn import RunningNorm, flatten_observation
 from .ensembles import Ensemble, Prediction
+from .planned import Imagining, encode_action
 
 OBJECTIVES = ("mean", "lcb", "ucb", "quantile")
 """What can be made of returns that differ from member to member: neither optimistic nor pessimistic; pessimistic; optimistic; either."""
@@ -62,7 +63,7 @@ class Belief(eqx.Module):
     alive: Float[Array, "E K"]
 
 
-class LearnedModel(Model):
+class LearnedModel(Imagining):
     """Members as a `Model` to plan in.
 
     - `objective`: what is made of the returns of different members. Rewards are handed out so that their discounted sum, by
@@ -140,43 +141,3 @@ class LearnedModel(Model):
         by_member = lambda x: x.ravel() if self.propagation == "ts1" else x.mean(1)  # noqa: E731
         risen = self.objective(by_member(returns)) - self.objective(by_member(state.returns))
         return risen / jnp.maximum(state.weight, jnp.finfo(risen.dtype).tiny)
-
-    def reward(self, state: Belief, action: Action, next_state: Belief) -> Float[Array, ""]:
-        del state, action
-        return next_state.reward
-
-    def terminal(self, state: Belief) -> Bool[Array, ""]:
-        # Ends are weighed, particle by particle.
-        return state.alive.max() < 1e-3
-
-
-def explored(
-    spec: Spec, planned: Action, random: Bool[Array, ""], noise: Float[Array, ""], key: PRNGKey, noise_key: PRNGKey
-) -> Action:
-    """A planned action with noise, or a random one where `random` says so: deviation `noise` in half-widths of the box, or of choices the
-    chance of another.
-    """
-    guess = spec.sample(key)
-    if spec.kind == "box":
-        span = jnp.ones(spec.shape)
-        if spec.is_bounded:
-            low, high = spec.bounds()
-            span = jnp.asarray(0.5 * (high - low))
-        planned = spec.clip(planned + noise * span * jax.random.normal(noise_key, span.shape))
-    else:
-        planned = jnp.where(jax.random.uniform(noise_key) < noise, guess, planned)
-    return jnp.where(random, guess, planned)
-
-
-def encode_action(spec: Spec, action: Action) -> Float[Array, "A"]:
-    """An action as a vector: a box clipped and in units of itself where it is bounded, choices as one-hot vectors."""
-    if spec.kind == "box":
-        clipped = spec.clip(action)
-        if not spec.is_bounded:
-            return clipped.ravel()
-        low, high = (jnp.asarray(bound, jnp.float32) for bound in spec.bounds())
-        return ((clipped - low) / (high - low) * 2.0 - 1.0).ravel()
-    if spec.kind == "multi_binary":
-        return action.astype(jnp.float32).ravel()
-    counts, choices = spec.counts, jnp.atleast_1d(action.ravel())
-    return jnp.concatenate([jax.nn.one_hot(choices[i], n) for i, n in enumerate(counts)])

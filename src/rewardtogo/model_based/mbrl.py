@@ -24,26 +24,21 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from ..core import (
-    Action,
     Batch,
-    Carry,
     EnvSpec,
-    Learner,
     Number,
-    Observation,
     Policy,
     PRNGKey,
-    Spec,
     number,
     part,
     setting,
 )
 from ..nn import Optimiser, RunningNorm, flat_size
-from ..planning.mpc import MPC, CrossEntropy, Planner
-from ..planning.problem import ModelProblem
+from ..planning.mpc import CrossEntropy, Planner
 from .ensembles import aleatoric, epistemic, gaussian_nll, is_held_out
 from .fit import Sample, bound, dynamics_data, standards
-from .learned import OBJECTIVES, LearnedModel, Objective, encode_action
+from .learned import OBJECTIVES, LearnedModel, Objective
+from .planned import ModelLearner, encoded_size, planning
 from .posteriors import Bootstrap, Posterior
 
 NOTHING = float(jnp.finfo(jnp.float32).max)
@@ -78,27 +73,7 @@ class ModelBasedState(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-class Exploring(Policy):
-    """Plans, or acts at random while there is nothing to plan with."""
-
-    planning: MPC
-    random: Bool[Array, ""]
-    action: Spec = eqx.field(static=True)
-
-    def init(self, key: PRNGKey) -> Carry:
-        return self.planning.init(key)
-
-    def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
-        plan_key, random_key = jax.random.split(key)
-        after, planned, _ = self.planning(carry, observation, plan_key)
-        action = jnp.where(self.random, self.action.sample(random_key), planned)
-        return after, action, {}
-
-    def inspect(self, carry: Carry, observation: Observation) -> dict[str, Array]:
-        return self.planning.inspect(carry, observation)
-
-
-class ModelBased(Learner):
+class ModelBased(ModelLearner):
     """Learn a model of the environment from transitions, and act by planning in it. Any action but pictures' and dictionaries'."""
 
     sizes: tuple[int, ...] = setting((64, 64), "widths of the members' hidden layers")
@@ -156,7 +131,7 @@ class ModelBased(Learner):
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> ModelBasedState:
         network_key, draw_key = jax.random.split(key)
-        states, actions = flat_size(spec.observation), encode_action(spec.action, spec.action.zeros()).size
+        states, actions = flat_size(spec.observation), encoded_size(spec.action)
         targets = states + (self.reward is None)
         parameters = self.posterior.init(states + actions, targets, self.sizes, self.members, network_key)
         zero, nothing = jnp.zeros((), jnp.int32), jnp.full((), NOTHING, jnp.float32)
@@ -179,14 +154,8 @@ class ModelBased(Learner):
         )  # fmt: skip
 
     def policy(self, state: ModelBasedState, explore: bool) -> Policy:
-        problem = ModelProblem(
-            self.model(state), self.horizon, state.spec.action, jnp.asarray(self.at(state.updates).gamma, jnp.float32)
-        )
-        planning = MPC(problem, self.planner, self.every)
-        if not explore:
-            return planning
-        random = (state.updates == 0) | (self.acting == "random")
-        return Exploring(planning, random, state.spec.action)
+        now, random = self.at(state.updates), (state.updates == 0) | (self.acting == "random")
+        return planning(now, self.model(state), state.spec.action, explore, random, every=self.every)
 
     def update(
         self, state: ModelBasedState, batch: Batch, key: PRNGKey
@@ -203,9 +172,7 @@ class ModelBased(Learner):
         noise = None if self.probabilistic else 1.0
         learned_from = jnp.maximum(size * (1.0 - now.holdout), 1.0)
         loss = lambda p: bound(self.posterior, p, sample, shares, learned_from, noise, bound_key)  # noqa: E731
-        (value, said), gradient = jax.value_and_grad(loss, has_aux=True)(state.parameters)
-        rule = Optimiser(now.learning_rate, now.max_grad_norm)
-        parameters, optimiser = rule.step(state.parameters, gradient, state.optimiser)
+        parameters, optimiser, value, said = now.descended(loss, state.parameters, state.optimiser)
         error = ((said.mean.mean(0) - sample.y) ** 2).mean(1)
         share = lambda mask, x: (mask * x).sum() / jnp.maximum(mask.sum(), 1.0)  # noqa: E731
         best, stopped = state.best, jnp.zeros((), bool)
@@ -223,22 +190,10 @@ class ModelBased(Learner):
             "stopped": stopped.astype(jnp.float32),
         }
         ends = state.ends | t.terminated.any()
-        return (
-            ModelBasedState(
-                parameters,
-                jax.random.bits(draw_key),
-                inputs,
-                targets,
-                optimiser,
-                state.updates + 1,
-                size,
-                ends,
-                best,
-                state.spec,
-            ),
-            metrics,
-            (),
-        )
+        state = ModelBasedState(
+            parameters, jax.random.bits(draw_key), inputs, targets, optimiser, state.updates + 1, size, ends, best, state.spec
+        )  # fmt: skip
+        return state, metrics, ()
 
     def _judged(
         self, best: Best, parameters: PyTree, loss: Float[Array, ""], any_held: Bool[Array, ""], grown: Bool[Array, ""]

@@ -31,8 +31,6 @@ from ..core import (
     Batch,
     Carry,
     EnvSpec,
-    Learner,
-    Model,
     Number,
     Observation,
     Policy,
@@ -48,7 +46,16 @@ from ..planning.mpc import CrossEntropy, Planner, shifted
 from ..planning.problem import ModelProblem
 from .fit import standards
 from .latent import Dense
-from .learned import encode_action, explored
+from .planned import (
+    Imagining,
+    ModelLearner,
+    encode_action,
+    encoded_size,
+    explored,
+    gaussian,
+    scaled,
+    standardised_rewards,
+)
 
 LEAST_STD = 0.1
 """Of the random state, as in PlaNet."""
@@ -91,22 +98,16 @@ class StateSpace(eqx.Module):
     ) -> tuple[Float[Array, "M"], DiagGaussian]:
         """h_t, and p(s_t | h_t)."""
         memory = self.cell(memory, jnp.concatenate([state, action]))
-        return memory, gaussian(self.prior(memory))
+        return memory, gaussian(self.prior(memory), LEAST_STD)
 
     def filtered(self, memory: Float[Array, "M"], code: Float[Array, "E"]) -> DiagGaussian:
         """q(s_t | h_t, o_t), of what `encoder` made of o_t."""
-        return gaussian(self.posterior(jnp.concatenate([memory, code])))
+        return gaussian(self.posterior(jnp.concatenate([memory, code])), LEAST_STD)
 
     def shown(self, memory: Float[Array, "M"], state: Float[Array, "S"]) -> tuple[Float[Array, "O"], Float[Array, "2"]]:
         """Mean of the observation; standardised reward that led here, and the logit of an end."""
         both = jnp.concatenate([memory, state])
         return self.decoder(both), self.outcome(both)
-
-
-def gaussian(raw: Float[Array, "D"]) -> DiagGaussian:
-    """Mean and deviation of the random state from a network's output."""
-    mean, spread = jnp.split(raw, 2)
-    return DiagGaussian(mean, jnp.log(jax.nn.softplus(spread) + LEAST_STD))
 
 
 class Bound(eqx.Module):
@@ -137,7 +138,7 @@ def sequence_bound(
     steps, count = rewards.shape
     empty = jnp.zeros(memory_size)
     codes_before, codes_after = (jax.vmap(jax.vmap(model.encoder))(x) for x in (before, after))
-    start_law = gaussian(model.prior(empty))
+    start_law = gaussian(model.prior(empty), LEAST_STD)
 
     def beginning(code: Array, k: PRNGKey) -> tuple[Array, Array]:
         law = model.filtered(empty, code)
@@ -186,7 +187,7 @@ class Dream(eqx.Module):
     alive: Float[Array, ""]
 
 
-class StateSpaceModel(Model):
+class StateSpaceModel(Imagining):
     """The recurrent state-space model as a `Model` to plan in."""
 
     networks: StateSpace
@@ -214,13 +215,6 @@ class StateSpaceModel(Model):
         outcome = self.networks.outcome(jnp.concatenate([memory, following]))
         reward = self.rewards.mean[""][0] + self.rewards.sd()[0] * outcome[0]
         return Dream(memory, following, state.alive * reward, state.alive * jax.nn.sigmoid(-outcome[1]))
-
-    def reward(self, state: Dream, action: Action, next_state: Dream) -> Float[Array, ""]:
-        del state, action
-        return next_state.reward
-
-    def terminal(self, state: Dream) -> Bool[Array, ""]:
-        return state.alive < 1e-3
 
 
 class Remembered(eqx.Module):
@@ -268,8 +262,9 @@ class PlaNetPolicy(Policy):
     def __call__(self, carry: Carry, observation: Observation, key: PRNGKey) -> tuple[Carry, Action, dict[str, Array]]:
         plan_key, random_key, noise_key = jax.random.split(key, 3)
         now, spec = self.filter(carry, observation), self.model.action
-        solution = self.planner(self._problem, now, shifted(carry.plan, jnp.where(carry.fresh, 0, 1)), plan_key)
-        plan = solution.value.actions
+        guess = shifted(carry.plan, jnp.where(carry.fresh, 0, 1))
+        search = lambda: self.planner(self._problem, now, guess, plan_key).value.actions  # noqa: E731
+        plan = jax.lax.cond(self.random, lambda: guess, search)
         action = explored(spec, plan[0], self.random, self.noise, random_key, noise_key)
         kept = Remembered(now.memory, now.state, encode_action(spec, action), plan, jnp.zeros((), bool))
         return kept, action, {}
@@ -290,7 +285,7 @@ class PlaNetState(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-class PlaNet(Learner):
+class PlaNet(ModelLearner):
     """Learn a recurrent state-space model from sequences, and act by planning in it from a filtered state. Any actions but binary ones."""
 
     memory_size: int = setting(64, "numbers in the deterministic memory h", at_least=1)
@@ -326,7 +321,7 @@ class PlaNet(Learner):
         return ("discrete", "multi_discrete", "box")
 
     def init(self, spec: EnvSpec, key: PRNGKey) -> PlaNetState:
-        seen, actions = flat_size(spec.observation), encode_action(spec.action, spec.action.zeros()).size
+        seen, actions = flat_size(spec.observation), encoded_size(spec.action)
         h, s, code, keys = self.memory_size, self.state_size, self.encoder_sizes[-1], jax.random.split(key, 6)
         networks = StateSpace(
             Cell.of(s + actions, h, keys[0]),
@@ -355,7 +350,7 @@ class PlaNet(Learner):
         now, real = self.at(state.updates), lambda x: jnp.asarray(x, jnp.float32)
         random = (state.updates == 0) if explore else jnp.zeros((), bool)
         noise = real(now.noise) if explore else jnp.zeros(())
-        return PlaNetPolicy(self.model(state), self.planner, real(now.gamma), random, noise, self.horizon)
+        return PlaNetPolicy(self.model(state), now.planner, real(now.gamma), random, noise, self.horizon)
 
     def update(self, state: PlaNetState, batch: Batch, key: PRNGKey) -> tuple[PlaNetState, dict[str, Array], Any]:
         now, t, spec = self.at(state.updates), batch.transitions, state.spec
@@ -364,19 +359,16 @@ class PlaNet(Learner):
         model = eqx.tree_at(lambda m: m.observations, self.model(state), observations)
         before, after = (jax.vmap(jax.vmap(model.vector))(x) for x in (t.observation, t.next_observation))
         actions = jax.vmap(jax.vmap(lambda a: encode_action(spec.action, a)))(t.action)
-        wanted = (t.reward - rewards.mean[""][0]) / rewards.sd()[0]
+        wanted = standardised_rewards(rewards, t.reward)
         ended, done = t.terminated.astype(jnp.float32), t.terminated | t.truncated
         free = jnp.asarray(now.free_nats, jnp.float32)
 
         def loss(networks: StateSpace) -> tuple[Float[Array, ""], Bound]:
             terms = sequence_bound(networks, before, after, actions, wanted, ended, done, batch.weights, free, key)
-            scaled = lambda error, scale: 0.5 * error / jnp.asarray(scale, jnp.float32) ** 2  # noqa: E731
             total = scaled(terms.observation, now.observation_scale) + scaled(terms.reward, now.reward_scale)
             return total + terms.limited_kl + terms.end, terms
 
-        (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(state.networks)
-        rule = Optimiser(now.learning_rate, now.max_grad_norm)
-        networks, optimiser = rule.step(state.networks, gradient, state.optimiser)
+        networks, optimiser, value, terms = now.descended(loss, state.networks, state.optimiser)
         metrics = {
             "model_loss": value,
             "kl": terms.kl,

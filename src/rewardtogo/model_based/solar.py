@@ -32,7 +32,6 @@ from ..core import (
     Action,
     Carry,
     EnvSpec,
-    Learner,
     Number,
     Observation,
     Policy,
@@ -53,7 +52,7 @@ from ..planning.kl_constrained import adapted_step, expected_cost, kl_constraine
 from ..planning.linear_quadratic import LinearController, LQProblem
 from .fit import standards
 from .latent import Dense
-from .learned import encode_action
+from .planned import ModelLearner, encode_action, scaled, standardised_rewards
 from .structured import (
     ExpectedDynamics,
     Laws,
@@ -215,7 +214,7 @@ class SOLARState(eqx.Module):
     spec: EnvSpec = eqx.field(static=True)
 
 
-class SOLAR(Learner):
+class SOLAR(ModelLearner):
     """Learn a latent linear-quadratic model from whole episodes, and improve controllers of each time step in it. Boxes alone.
 
     Episodes are all `horizon` steps long, and a rollout is one of them: `--loop.unroll` is the horizon. Others are not learned from.
@@ -324,7 +323,7 @@ class SOLAR(Learner):
         prior, learning = self.prior(spec.action.size), state.updates >= self.warm_up
 
         def costs_of(rewards: Array) -> Array:
-            return -(rewards - standard.mean[""][0]) / standard.sd()[0]
+            return -standardised_rewards(standard, rewards)
 
         def potentials_of(networks: SOLARNetworks, seen: PyTree[Array]) -> DiagGaussian:
             return jax.vmap(jax.vmap(lambda o: networks(observations(o))))(seen)
@@ -346,13 +345,10 @@ class SOLAR(Learner):
                 )
                 mean = lambda x: (weights * x).sum() / jnp.maximum(weights.sum(), 1.0)  # noqa: E731
                 terms = jax.tree.map(mean, terms)
-                scaled = lambda error, scale: 0.5 * error / jnp.asarray(scale, jnp.float32) ** 2  # noqa: E731
                 total = scaled(terms.observation, now.observation_scale) + scaled(terms.cost, now.cost_scale)
                 return total + terms.state_kl, (terms, weighted_sum(moments, weights))
 
-            (value, (terms, moments)), gradient = jax.value_and_grad(loss, has_aux=True)(networks)
-            rule = Optimiser(now.learning_rate, now.max_grad_norm)
-            networks, optimiser = rule.step(networks, gradient, optimiser)
+            networks, optimiser, value, (terms, moments) = now.descended(loss, networks, optimiser)
             # The batch stands for all that is remembered.
             share = memory.whole.sum() / jnp.maximum(weights.sum(), 1.0)
             wanted_law = prior.observe(jax.tree.map(lambda m: m.sum(0), moments).scaled(share))
