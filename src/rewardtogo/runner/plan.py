@@ -131,7 +131,9 @@ def plan(
             whole = build(cls, options, env=vector_env, learner=inner, **more)
     steps = int(steps or ready.get("steps", DEFAULT_STEPS))
     iterations = _iterations(whole, steps)
-    eval_episodes = eval_episodes or (known_row and known_row.eval_episodes) or _episodes(whole, steps, evaluations)
+    eval_episodes = eval_episodes or (known_row and known_row.eval_episodes)
+    if not eval_episodes:
+        eval_episodes, evaluations = _evaluations(whole, steps, evaluations)
     row_every = max(1, iterations // ROWS)
     eval_every = max(1, round(iterations / max(1, evaluations) / row_every)) * row_every
     whole = whole.with_horizon(iterations)
@@ -214,14 +216,17 @@ def from_config(
     return Plan(whole, inner, vector_env, eval_env, config)
 
 
-def _episodes(whole: Algorithm, steps: int, evaluations: int) -> int:
-    """Of an evaluation, of the policy at its best and as it explores each: as many as suit what is acted in for `steps` steps."""
+def _evaluations(whole: Algorithm, steps: int, most: int) -> tuple[int, int]:
+    """Episodes of an evaluation, of the policy at its best and as it explores each, and how many evaluations there are on the way:
+    as many of either as suit what is acted in for `steps` steps.
+    """
     doors = hosted(_env_of(whole))
     if not doors:
-        return EVAL_EPISODES
-    length = doors[0].time_limit or HOSTED_EPISODE
-    fitting = int(HOSTED_SHARE * steps / (2 * max(1, evaluations) * length))
-    return min(EVAL_EPISODES, max(HOSTED_LEAST, fitting))
+        return EVAL_EPISODES, most
+    both = 2 * (doors[0].time_limit or HOSTED_EPISODE)
+    fitting = HOSTED_SHARE * steps / both
+    episodes = min(EVAL_EPISODES, max(HOSTED_LEAST, int(fitting / max(1, most))))
+    return episodes, min(most, max(1, int(fitting / episodes)))
 
 
 def _dataset(data: Any) -> Dataset:
