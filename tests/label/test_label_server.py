@@ -240,7 +240,6 @@ def test_what_is_no_request_at_all(page):
 
 
 def test_pictures(page):
-    pytest.importorskip("pygame", reason="pictures need the extra render")
     status, body, headers = Browser(page.port).raw("/frame/1/3.png")
     assert status == 200 and headers["content-type"] == "image/png" and body.startswith(b"\x89PNG")
 
