@@ -161,9 +161,7 @@ def test_cartpole_by_keyboard_killed_finished_and_cloned(browser, start, tmp_pat
     process.kill()
     process.communicate()
     text(page, "message", re.compile("The server does not answer. Every episode that was kept is on the disk"))
-    process, address = start(
-        "CartPole-v1", "--out", out.name, "--episodes", 3, "--pause", 1, "--rate", 25, folder=tmp_path
-    )
+    process, address = start("CartPole-v1", "--out", out.name, "--episodes", 3, "--pause", 1, "--rate", 25)
     page.goto(address)
     text(page, "count", "1 of 3")
     kept = 1
