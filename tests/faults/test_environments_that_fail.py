@@ -77,6 +77,8 @@ def test_what_was_learnt_before_the_failure_is_kept(workplace, capsys):
         return step(self, action)
 
     with pytest.MonkeyPatch.context() as patch:
+        # Evaluations end chunks: one after each iteration, however long they take outside of the program.
+        patch.setattr("rewardtogo.runner.plan.HOSTED_SHARE", 1e9)
         patch.setattr(evaluate.Evaluator, "__call__", lambda *_: (np.zeros(20), np.ones(20)))
         patch.setattr(Faulty, "step", late)
         assert main([*command, *fault]) == 1

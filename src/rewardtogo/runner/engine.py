@@ -154,7 +154,9 @@ class Program:
         """A fresh state: one compiled program, because op by op costs seconds."""
         # It runs once, so that optimising it would cost more than it saves.
         quickly = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
-        ahead = threading.Thread(target=self._compile_ahead)
+        # Asked here: another thread does not see the mesh of this one.
+        alone = jax.sharding.get_mesh().empty and not hosted(self.algorithm)
+        ahead = threading.Thread(target=self._compile_ahead if alone else lambda: None)
         ahead.start()
         try:
             program = self._compile(self._init_all, self.algorithm, self.key, compiler_options=quickly)
@@ -167,8 +169,6 @@ class Program:
 
     def _compile_ahead(self) -> None:
         """Compile `advance` from shapes alone, beside `init`. What fails here is met again, and told, where it is called."""
-        if not jax.sharding.get_mesh().empty or hosted(self.algorithm):
-            return
         try:
             state = self.shapes()
             self._advance = self._compile_advance(state, self.fresh_sums(state))
