@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from imitating import run, spec_of, steps
 
+import rewardtogo as rtg
 from rewardtogo.core import env_spec
 from rewardtogo.envs.cartpole import CartPole
 from rewardtogo.envs.imitation_problems import Lane
@@ -306,3 +307,15 @@ def test_drift_and_its_cure(key, item):
 def test_what_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_several_seeds_learn_in_one_program(tmp_path):
+    """Each judges its own policies, and has the scores that `evaluation.json` says."""
+    balance = lambda observation: (observation[2] + observation[3] > 0).astype(jnp.int32)  # noqa: E731
+    options = {"expert": balance, "steps": 256, "learner": {"network": {"sizes": [8]}}, "quiet": True}
+    loop = {"unroll": 64, "updates": 20, "batch_size": 32}
+    made = rtg.train("dagger", "CartPole-v1", num_seeds=2, loop=loop, out=tmp_path / "run", **options)
+    first, second = ((r.path / "policy.safetensors").read_bytes() for r in made)
+    assert first != second
+    for r in made:
+        assert r.evaluation is not None and r.evaluation["episodes"] == 100

@@ -234,7 +234,7 @@ class Algorithm(eqx.Module):
 
     @abstractmethod
     def learned(self, state: State) -> State:
-        """The learner's part of the state: what must stay finite."""
+        """The learner's part of the state: what must stay finite. Works on states of several seeds, with a leading axis, too."""
 
     @abstractmethod
     def policy(self, state: State, explore: bool = False) -> Policy:

@@ -278,7 +278,9 @@ class DAgger(Algorithm, Configured):
     def learned(self, state: DAggerState) -> State:
         """The best policy's learner; the newest one where none was judged yet."""
         judged = jnp.isfinite(state.best_mistakes)
-        return jax.tree.map(lambda best, new: jnp.where(judged, best, new), state.best, state.learner)
+        # Of several seeds everything has a leading axis more.
+        along = lambda x: judged.reshape(judged.shape + (1,) * (x.ndim - judged.ndim))  # noqa: E731
+        return jax.tree.map(lambda best, new: jnp.where(along(new), best, new), state.best, state.learner)
 
     def policy(self, state: DAggerState, explore: bool = False) -> Policy:
         return self.learner.policy(self.learned(state), explore)
