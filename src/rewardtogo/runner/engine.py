@@ -154,16 +154,18 @@ class Program:
         """A fresh state: one compiled program, because op by op costs seconds."""
         # It runs once, so that optimising it would cost more than it saves.
         quickly = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
+        ahead = threading.Thread(target=self._compile_ahead)
         # Asked here: another thread does not see the mesh of this one.
         alone = jax.sharding.get_mesh().empty and not hosted(self.algorithm)
-        ahead = threading.Thread(target=self._compile_ahead if alone else lambda: None)
-        ahead.start()
+        if alone:
+            ahead.start()
         try:
             program = self._compile(self._init_all, self.algorithm, self.key, compiler_options=quickly)
             state = self.guarded(lambda: program(self.algorithm, self.key))
         finally:
             began = time.perf_counter()
-            ahead.join()
+            if alone:
+                ahead.join()
             self.compile_seconds += time.perf_counter() - began
         return state
 
