@@ -312,6 +312,10 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     return main, table
 
 
+NESTED = {"demonstrate": ("env",), "label": ("learner", "loop", "env"), "solve": ("env",)}
+"""Commands besides `train` that take options by group, and the groups."""
+
+
 def value_of(text: Any) -> Any:
     """What an option's text stands for: JSON where it is some, else itself."""
     if not isinstance(text, str):
@@ -413,12 +417,9 @@ def _dispatch(parser: Parser, table: dict[str, Parser], arguments: list[str]) ->
             return 0
         options, rest = table["train"].parse_known_args(arguments[1:])
         groups = _nested(rest, ("learner", "loop", "env"))
-    elif arguments[0] in ("demonstrate", "solve") and not any(a in ("-h", "--help") for a in arguments):
+    elif arguments[0] in NESTED and not any(a in ("-h", "--help") for a in arguments):
         options, rest = table[arguments[0]].parse_known_args(arguments[1:])
-        groups = _nested(rest, ("env",), arguments[0])
-    elif arguments[0] == "label" and not any(a in ("-h", "--help") for a in arguments):
-        options, rest = table["label"].parse_known_args(arguments[1:])
-        groups = _nested(rest, ("learner", "loop", "env"), "label")
+        groups = _nested(rest, NESTED[arguments[0]], arguments[0])
     elif arguments[0] == "plan":
         if any(a in ("-h", "--help") for a in arguments):
             table["plan"].print_help()
