@@ -2,51 +2,19 @@
 
 import os
 import re
-import shutil
 import subprocess
-import sys
 from pathlib import Path
 
-import pytest
+from chromium import MARKS, served, text
 
 import rewardtogo as rtg
 
-pytest.importorskip("starlette", reason="the page needs the extra web")
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="the browser is driven by Playwright: pip install playwright"
-)
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine: install the package chromium"),
-]
+pytestmark = MARKS
 QUICK = ["--learner.network.sizes", "8", "--loop.updates", "5", "--loop.batch-size", "16", "--pause", "1"]
 
 
 def start(*arguments: object) -> tuple[subprocess.Popen, str]:
-    """The command, and the address that it prints."""
-    line = [sys.executable, "-m", "rewardtogo.cli.main", "label", *map(str, arguments), "--port", "0"]
-    process = subprocess.Popen(line, env=os.environ | {"JAX_PLATFORMS": "cpu"}, stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    for text in process.stderr:
-        if found := re.search(r"http://\S+", text):
-            return process, found[0]
-    raise AssertionError("it printed no address")
-
-
-@pytest.fixture
-def browser():
-    with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield found
-        found.close()
-
-
-def text(page, place: str, wanted: str | re.Pattern, timeout: float = 20_000) -> None:
-    """Wait until it stands there."""
-    playwright.expect(page.locator(f"#{place}")).to_have_text(wanted, timeout=timeout)
+    return served("label", *arguments)
 
 
 def answered(page, count: int, size: int) -> None:

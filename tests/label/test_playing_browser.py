@@ -2,28 +2,18 @@
 
 import os
 import re
-import shutil
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import MARKS, served, text
 
 import rewardtogo as rtg
 from rewardtogo.data import load_dataset
 
-pytest.importorskip("starlette", reason="the page needs the extra web")
-playwright = pytest.importorskip(
-    "playwright.sync_api", reason="the browser is driven by Playwright: pip install playwright"
-)
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine: install the package chromium"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture
@@ -32,34 +22,14 @@ def start(tmp_path):
     begun = []
 
     def begin(*arguments: object) -> tuple[subprocess.Popen, str]:
-        line = [sys.executable, "-m", "rewardtogo.cli.main", "demonstrate", *map(str, arguments), "--port", "0"]
-        process = subprocess.Popen(
-            line, env=os.environ | {"JAX_PLATFORMS": "cpu"}, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )  # fmt: skip
+        process, address = served("demonstrate", *arguments, folder=tmp_path)
         begun.append(process)
-        assert process.stderr is not None
-        for text in process.stderr:
-            if found := re.search(r"http://\S+", text):
-                return process, found[0]
-        raise AssertionError("it printed no address")
+        return process, address
 
     yield begin
     for process in begun:
         process.kill()
         process.communicate()
-
-
-@pytest.fixture
-def browser():
-    with playwright.sync_playwright() as driver:
-        found = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield found
-        found.close()
-
-
-def text(page, place: str, wanted: str | re.Pattern, timeout: float = 20_000) -> None:
-    """Wait until it stands there."""
-    playwright.expect(page.locator(f"#{place}")).to_have_text(wanted, timeout=timeout)
 
 
 def number(page, place: str) -> float:
